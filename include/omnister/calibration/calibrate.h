@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file Fitting lens surfaces to corners of a board.
+#pragma once
+
+#include <Eigen/Core>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "omnister/calibration/detections.h"
+#include "omnister/common/pose.h"
+#include "omnister/common/progress.h"
+#include "omnister/lens/lens_file.h"
+#include "omnister/lens/lens_models.h"
+
+namespace omnister {
+
+struct CalibrationOptions {
+  std::string model = "auto";         ///< "auto" or a name of lensModelNames()
+  /// Exactly this structure instead of a choice within `model`.
+  std::optional<LensStructure> structure;
+  int folds = 0;                      ///< interleaved folds; 0: only what "auto" needs (5)
+  bool board_warp = true;             ///< fit two parameters of board curvature
+  int threads = 0;                    ///< 0: every core
+  Progress progress;
+};
+
+/// One view after the fit.
+struct ViewResult {
+  std::string name;
+  Pose T_camera_board;                         ///< board to camera, board units
+  double rms_px = 0.0;
+  std::vector<Eigen::Vector2d> residuals;      ///< observed - predicted [px]
+  bool used = true;                            ///< false: rejected as a whole
+  std::string reason;                          ///< why it was not used
+};
+
+/// One candidate of the choice among structures.
+struct CandidateResult {
+  LensStructure structure;
+  double rms_px = 0.0;
+  std::optional<double> holdout_rms_px;
+  bool chosen = false;
+};
+
+struct CalibrationResult {
+  LensFile file;                               ///< lens, covariance and record, ready to write
+  Eigen::Vector2d board_warp = Eigen::Vector2d::Zero();  ///< see calibrate()
+  std::vector<ViewResult> views;
+  std::vector<CandidateResult> candidates;
+  double rms_px = 0.0;                         ///< over all corners of used views, 2-D error per corner
+  std::optional<double> holdout_rms_px;
+  int points = 0;
+  std::vector<std::string> warnings;           ///< for a person: bad images by name, poor coverage, …
+};
+
+/// Joint adjustment of lens, poses and board warp with a robust loss, started from bearings without a
+/// focal guess.
+/// @throws Error with the reason where the data cannot carry a calibration (too few views, boards only
+/// square to the axis, …). Never returns a failed fit.
+CalibrationResult calibrate(const Detections& detections, const CalibrationOptions& options);
+
+struct StereoCalibrationResult {
+  CalibrationResult left;
+  CalibrationResult right;
+  Pose T_left_right;                           ///< maps right (displaced) into left (reference)
+  double rms_px = 0.0;                         ///< joint, over the corners of both cameras
+  std::vector<std::string> warnings;
+};
+
+/// The same adjustment over two rigidly joined cameras; view i of both saw the board at one instant.
+/// Views are paired by index; a view may be empty where one camera did not see the board.
+StereoCalibrationResult calibrateStereo(const Detections& left, const Detections& right,
+                                        const CalibrationOptions& options);
+
+}  // namespace omnister

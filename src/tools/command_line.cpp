@@ -1,0 +1,117 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "command_line.h"
+
+#include <unistd.h>
+
+#include <chrono>
+#include <csignal>
+#include <cstdio>
+#include <deque>
+#include <iostream>
+#include <memory>
+#include <opencv2/core/utils/logger.hpp>
+
+#include "commands.h"
+#include "omnister/common/error.h"
+#include "omnister/common/numbers.h"
+
+namespace omnister::tools {
+
+// One line a subcommand, in the order of --help.
+// (declarations here, table below: kept together so that adding a command touches one place)
+
+namespace {
+
+constexpr AddCommand kCommands[] = {
+    nullptr,
+};
+
+std::string describe(const nlohmann::ordered_json& value) {
+  return value.is_string() ? value.get<std::string>() : value.dump();
+}
+
+}  // namespace
+
+bool& addJsonFlag(CLI::App& command) {
+  static std::deque<bool> flags;
+  bool& flag = flags.emplace_back(false);
+  command.add_flag("--json", flag, "Print one JSON object on standard output and nothing else there");
+  return flag;
+}
+
+void printResult(bool json, const nlohmann::ordered_json& result) {
+  if (json) {
+    std::cout << result.dump() << '\n';
+  } else {
+    for (const auto& [key, value] : result.items()) {
+      std::cout << key << ": " << describe(value) << '\n';
+    }
+  }
+  std::cout.flush();
+  if (!std::cout) throw Error("cannot write to standard output");
+}
+
+void say(const std::string& message) { std::cerr << message << '\n'; }
+
+Progress consoleProgress() {
+  using Clock = std::chrono::steady_clock;
+  struct State {
+    Clock::time_point start = Clock::now();
+    Clock::time_point last{};
+    std::string stage;
+  };
+  const bool terminal = ::isatty(STDERR_FILENO) == 1;
+  return [state = std::make_shared<State>(), terminal](double fraction, const std::string& stage) {
+    const auto now = Clock::now();
+    if (stage != state->stage) {
+      state->stage = stage;
+      state->start = now;
+    } else if (fraction < 1.0 && now - state->last < std::chrono::milliseconds(terminal ? 200 : 2000)) {
+      return;
+    }
+    state->last = now;
+    const double elapsed = std::chrono::duration<double>(now - state->start).count();
+    const double left = fraction > 0.0 ? elapsed * (1.0 - fraction) / fraction : 0.0;
+    std::fprintf(stderr, terminal ? "\r\033[K%s: %.0f %%, %.0f s left%s" : "%s: %.0f %%, %.0f s left%s",
+                 stage.c_str(), 100.0 * fraction, left, !terminal || fraction >= 1.0 ? "\n" : "");
+    std::fflush(stderr);
+  };
+}
+
+bool lexical_cast(const std::string& text, Size& size) {
+  const std::size_t cross = text.find('x');
+  if (cross == std::string::npos) return false;
+  const auto width = parseNumber(text.substr(0, cross));
+  const auto height = parseNumber(text.substr(cross + 1));
+  if (!width || !height) return false;
+  const auto whole = [](double value) { return value >= 1 && value <= 65535 && value == int(value); };
+  if (!whole(*width) || !whole(*height)) return false;
+  size = {static_cast<int>(*width), static_cast<int>(*height)};
+  return true;
+}
+
+int runCommandLine(int argc, const char* const* argv) {
+  // Our messages say what is wrong with a file; a library's chatter would come before them.
+  cv::utils::logging::setLogLevel(cv::utils::logging::LOG_LEVEL_SILENT);
+  CLI::App app("OMNister: wide-angle stereo from distorted images", "omnister");
+  app.set_version_flag("--version", OMNISTER_VERSION);
+  app.require_subcommand(1);
+  for (const AddCommand add : kCommands) {
+    if (add != nullptr) add(app);
+  }
+  try {
+    app.parse(argc, argv);
+    return 0;
+  } catch (const CLI::ParseError& error) {
+    return app.exit(error) == 0 ? 0 : 2;
+  } catch (const Error& error) {
+    std::cerr << "omnister: " << error.what() << '\n';
+  } catch (const std::bad_alloc&) {
+    std::cerr << "omnister: not enough memory\n";
+  } catch (const std::exception& error) {
+    std::cerr << "omnister: " << printable(error.what(), 1000) << '\n';
+  }
+  return 1;
+}
+
+}  // namespace omnister::tools

@@ -1,0 +1,38 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file The subcommands. Each adds itself to the application with a callback that does the work and
+/// throws Error where a person can mend something.
+#pragma once
+
+#include <CLI/CLI.hpp>
+#include <nlohmann/json.hpp>
+#include <string>
+
+#include "omnister/common/progress.h"
+
+namespace omnister::tools {
+
+/// Adds `--json` to a subcommand. @return where the flag is stored; lives as long as the application
+bool& addJsonFlag(CLI::App& command);
+
+/// The result of a subcommand: one JSON object on standard output with --json, else one "key: value"
+/// line each.
+void printResult(bool json, const nlohmann::ordered_json& result);
+
+/// A remark for a person, on standard error.
+void say(const std::string& message);
+
+/// Progress on standard error, at most a few lines a second, with percentage and time left; rewrites
+/// its line on a terminal.
+Progress consoleProgress();
+
+/// "1280x960". @throws CLI::ValidationError (wrong usage)
+struct Size {
+  int width = 0;
+  int height = 0;
+};
+bool lexical_cast(const std::string& text, Size& size);
+
+/// Every subcommand has one of these, in the file of its name.
+using AddCommand = void (*)(CLI::App& app);
+
+}  // namespace omnister::tools
