@@ -19,8 +19,7 @@ catkin_package(
   INCLUDE_DIRS include
   LIBRARIES omnister_core omnister_device
   CATKIN_DEPENDS actionlib actionlib_msgs cv_bridge geometry_msgs image_transport message_runtime
-    nodelet roscpp sensor_msgs std_msgs std_srvs tf2_ros visualization_msgs
-  DEPENDS EIGEN3 OpenCV)
+    nodelet roscpp sensor_msgs std_msgs std_srvs tf2_ros visualization_msgs)
 
 set(OMNISTER_BIN_DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})
 set(OMNISTER_LIB_DESTINATION ${CATKIN_PACKAGE_LIB_DESTINATION})
