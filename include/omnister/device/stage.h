@@ -1,0 +1,56 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file What every translation stage does. No ROS here. Metres, seconds; device units end at the
+/// backend.
+#pragma once
+
+#include <string>
+
+#include "omnister/common/error.h"
+#include "omnister/device/camera.h"
+
+namespace omnister::device {
+
+/// One consistent reading.
+struct StageReading {
+  Stamp stamp;              ///< when the position was so
+  double position_m = 0.0;  ///< along the axis, from home; from power-up while not homed
+  double velocity_mps = 0.0;
+  bool homed = false;   ///< the position is referenced
+  bool moving = false;  ///< includes homing
+  std::string fault;    ///< by name; empty when there is none. A fault stays until recover()
+};
+
+struct StageIdentity {
+  std::string vendor;
+  std::string model;
+  std::string serial;
+};
+
+/// The stage refused a command (says why), or was lost.
+class StageError : public Error {
+ public:
+  using Error::Error;
+};
+
+/// All calls return at once; motion is watched by read(). Used from one thread at a time. Never
+/// moves unless told to, also not at construction.
+class Stage {
+ public:
+  virtual ~Stage() = default;
+  virtual StageIdentity identity() const = 0;
+  /// @throws StageError when the stage does not answer
+  virtual StageReading read() = 0;
+  /// Begins to move to a position; a motion under way is replaced.
+  /// @param speed_mps > 0; above the device's own limit, that limit
+  /// @throws StageError when refused: a fault, out of the device's limits, not homed where that
+  /// matters
+  virtual void moveTo(double position_m, double speed_mps) = 0;
+  /// Brakes as fast as the device can.
+  virtual void stop() = 0;
+  /// Begins to look for the reference. @throws StageError when refused
+  virtual void home() = 0;
+  /// Clears a fault as far as the device allows; never moves. @throws StageError
+  virtual void recover() = 0;
+};
+
+}  // namespace omnister::device
