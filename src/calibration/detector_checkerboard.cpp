@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: Apache-2.0
+// Plain checkerboards, by OpenCV's two detectors. Neither finds all that the other does, both miss
+// what a change of scale or contrast lets them find, and the classic one may search for half a
+// minute in a large image: small copies first, the costly attempts only while the time lasts.
+#include <algorithm>
+#include <cmath>
+#include <opencv2/calib3d.hpp>
+#include <opencv2/imgproc.hpp>
+
+#include "board_detectors.h"
+
+namespace omnister::detect {
+namespace {
+
+enum class Method { kSectors, kQuads };
+
+struct Attempt {
+  Method method;
+  double pixels;  ///< of the copy that is searched, about
+  bool enlarge;   ///< smaller images are enlarged to that, instead of taken as they are
+  bool equalize;  ///< local contrast
+};
+
+constexpr Attempt kAttempts[] = {
+    {Method::kSectors, 0.4e6, false, false}, {Method::kQuads, 0.4e6, false, false},
+    {Method::kQuads, 1.3e6, false, false},   {Method::kSectors, 1.3e6, false, false},
+    {Method::kQuads, 0.4e6, false, true},    {Method::kSectors, 0.4e6, false, true},
+    {Method::kQuads, 1.6e6, true, false},    {Method::kQuads, 1.3e6, false, true},
+    {Method::kSectors, 1.3e6, false, true},  {Method::kQuads, 0.12e6, false, false},
+    {Method::kSectors, 3.0e6, false, false}, {Method::kSectors, 1.6e6, true, false},
+};
+
+// The scales that differ too little from one already tried bring nothing.
+constexpr double kSameScale = 1.15;
+constexpr double kMaxEnlargement = 2.0;
+
+double scaleFor(const Attempt& attempt, const cv::Mat& image) {
+  const double fitting = std::sqrt(attempt.pixels / static_cast<double>(image.total()));
+  return std::min(fitting, attempt.enlarge ? kMaxEnlargement : 1.0);
+}
+
+std::optional<std::vector<cv::Point2f>> search(const cv::Mat& image, const Target& target,
+                                               Method method) {
+  const cv::Size pattern(target.cols, target.rows);
+  std::vector<cv::Point2f> corners;
+  bool found = false;
+  try {
+    if (method == Method::kSectors) {
+      found = cv::findChessboardCornersSB(image, pattern, corners,
+                                          cv::CALIB_CB_NORMALIZE_IMAGE | cv::CALIB_CB_EXHAUSTIVE);
+    } else {
+      found = cv::findChessboardCorners(
+          image, pattern, corners, cv::CALIB_CB_ADAPTIVE_THRESH | cv::CALIB_CB_NORMALIZE_IMAGE);
+    }
+  } catch (const cv::Exception&) {
+    // Both assert inside on odd images (too small for their filters, for one): no board there.
+    return std::nullopt;
+  }
+  if (!found || corners.size() != static_cast<std::size_t>(pattern.area())) return std::nullopt;
+  return corners;
+}
+
+// Half the corners may have been off by a few pixels of the small copy; one that jumped away from
+// what its neighbours say was drawn to something else.
+bool refine(const cv::Mat& fine, int cols, int rows, std::vector<cv::Point2f>& corners) {
+  const std::vector<double> spacing = gridSpacing(corners, cols, rows);
+  std::vector<double> windows(spacing.size());
+  std::transform(spacing.begin(), spacing.end(), windows.begin(), halfWindow);
+  const std::vector<bool> stayed = refineCorners(fine, windows, corners);
+  const auto lost = std::count(stayed.begin(), stayed.end(), false);
+  return lost * 10 <= static_cast<std::ptrdiff_t>(corners.size());
+}
+
+}  // namespace
+
+std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& target,
+                                       const Budget& budget) {
+  std::vector<Attempt> done;
+  std::vector<double> done_scales;
+  for (const Attempt& attempt : kAttempts) {
+    if (budget.spent()) break;
+    const double scale = scaleFor(attempt, image.eight_bit);
+    bool repeated = attempt.enlarge && scale < kSameScale;
+    for (std::size_t i = 0; i < done.size(); ++i) {
+      repeated =
+          repeated || (done[i].method == attempt.method && done[i].equalize == attempt.equalize &&
+                       std::abs(std::log(scale / done_scales[i])) < std::log(kSameScale));
+    }
+    if (repeated) continue;
+    done.push_back(attempt);
+    done_scales.push_back(scale);
+
+    ScaledImage copy = scaled(image.eight_bit, scale);
+    if (attempt.equalize) {
+      cv::Mat even;
+      cv::createCLAHE(4.0, {8, 8})->apply(copy.image, even);
+      copy.image = even;
+    }
+    auto corners = search(copy.image, target, attempt.method);
+    if (!corners) continue;
+    for (cv::Point2f& corner : *corners) corner = copy.toOriginal(corner);
+    auto ordered = orderGrid(*corners, target, &image.fine);
+    if (!ordered || !refine(image.fine, target.cols, target.rows, *ordered)) continue;
+    // Once more, for the refinement may have crossed a line over.
+    if (!orderGrid(*ordered, target, &image.fine)) continue;
+    std::vector<Corner> result;
+    for (std::size_t i = 0; i < ordered->size(); ++i) {
+      result.push_back({static_cast<int>(i), {(*ordered)[i].x, (*ordered)[i].y}});
+    }
+    return result;
+  }
+  return {};
+}
+
+}  // namespace omnister::detect
