@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 /// @file What every lens can do.
 ///
-/// Conventions. Optical frame (REP 103): +x right, +y down, +z forward. Pixel (0, 0) is the centre of
-/// the top-left pixel. A pixel becomes sensor coordinates about the centre of distortion,
+/// Conventions. Optical frame (REP 103): +x right, +y down, +z forward. Pixel (0, 0) is the centre
+/// of the top-left pixel. A pixel becomes sensor coordinates about the centre of distortion,
 ///     [x; y] = [[1 + p, q], [0, 1]]^-1 (pixel - center)          (affinity; p = q = 0 without one)
 /// and then the viewing ray (x, y, h(x, y)), h being the height of the lens surface in pixels
 /// (Johnson 1997, sec. 4.2). All models are central. Rays may point behind the camera.
@@ -44,7 +44,8 @@ class LensModel {
 
   /// Pixel to unit bearing, the inverse of project() to 1e-9 rad.
   /// @param d_pixel [out] d(bearing)/d(pixel), 3x2; skipped when null
-  /// @return nullopt where the ray is more than maxTheta() off the axis or the surface has no height
+  /// @return nullopt where the ray is more than maxTheta() off the axis or the surface has no
+  /// height
   virtual std::optional<Eigen::Vector3d> unproject(const Eigen::Vector2d& pixel,
                                                    Jacobian32* d_pixel = nullptr) const = 0;
 
@@ -52,8 +53,8 @@ class LensModel {
   /// pi/2, is below pi.
   virtual double maxTheta() const = 0;
 
-  /// Height of the lens surface over sensor coordinates relative to the centre, affinity undone [px];
-  /// nullopt outside the field. Rays are (x, y, surfaceHeight(x, y)) before decentring.
+  /// Height of the lens surface over sensor coordinates relative to the centre, affinity undone
+  /// [px]; nullopt outside the field. Rays are (x, y, surfaceHeight(x, y)) before decentring.
   virtual std::optional<double> surfaceHeight(double x, double y) const = 0;
 
   /// All free numbers of the model in the order of parameterNames(): the centre first, then the

@@ -6,6 +6,7 @@
 #include <map>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 #include "omnister/lens/lens_model.h"
@@ -18,28 +19,33 @@ const std::vector<std::string>& lensModelNames();
 /// What a model carries beyond its name.
 struct LensStructure {
   std::string model = "conic";
-  int even_terms = 0;        ///< asphere: how many of r^4, r^6, r^8 (0 to 3)
-  int knots = 12;            ///< spline: knots spaced evenly in angle (4 to 32)
-  bool affinity = false;     ///< p and q
-  bool decentring = false;   ///< asphere and spline only
-
+  int even_terms = 0;       ///< asphere: how many of r^4, r^6, r^8 (0 to 3)
+  int knots = 12;           ///< spline: knots spaced evenly in angle (4 to 32)
+  bool affinity = false;    ///< p and q
+  bool decentring = false;  ///< asphere and spline only
 };
 
-/// A lens of the structure that is nearest to the equidistant fisheye r = f theta: the starting point of
-/// every fit.
+/// A lens of the structure that is nearest to the equidistant fisheye r = f theta: the starting
+/// point of every fit.
 /// @param center [px]  @param focal_px pixels per radian on the axis, > 0
 /// @param max_theta half field of view [rad], in (0, pi)
 /// @throws Error for an unknown model or a structure it cannot carry
 LensPtr makeLens(const LensStructure& structure, const Eigen::Vector2d& center, double focal_px,
                  double max_theta);
 
+/// The named numbers of a lens' surface, affinity and decentring in file order (no centre).
+using NamedParameters = std::vector<std::pair<std::string, std::vector<double>>>;
+
+/// The inverse of makeLens() by name: what the `parameters` block of a lens file holds.
+NamedParameters namedParameters(const LensModel& lens);
+
 /// The structure of a lens.
 LensStructure structureOf(const LensModel& lens);
 
-/// The lens of a lens file's `parameters` block. Names not given take their neutral value where they
-/// have one (affinity and decentring 0).
-/// @throws InputError (with `source`) for missing, unknown or non-finite parameters, or a surface that
-/// is not one-to-one over the field
+/// The lens of a lens file's `parameters` block. Names not given take their neutral value where
+/// they have one (affinity and decentring 0).
+/// @throws InputError (with `source`) for missing, unknown or non-finite parameters, or a surface
+/// that is not one-to-one over the field
 LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
                  const std::map<std::string, std::vector<double>>& parameters, double max_theta,
                  std::string_view source);

@@ -1,0 +1,541 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "omnister/lens/lens_models.h"
+
+#include <Eigen/LU>
+#include <algorithm>
+#include <cmath>
+#include <type_traits>
+
+#include "omnister/common/error.h"
+#include "omnister/common/numbers.h"
+#include "omnister/lens/lens_fit.h"
+#include "surfaces.h"
+
+namespace omnister {
+namespace {
+
+using detail::AsphereProfile;
+using detail::ConicProfile;
+using detail::QuadricSurface;
+using detail::RadialSurface;
+using detail::SphericalProfile;
+using detail::SplineProfile;
+
+constexpr double kPi = 3.14159265358979323846;
+// A field reaches at most this far: the ray straight back has no azimuth.
+constexpr double kLargestField = kPi - 1e-3;
+constexpr double kMaxCenter = 1e7;  // [px]
+// A ray at exactly maxTheta() is inside whatever its rounding.
+constexpr double kCosSlack = 1e-12;
+constexpr double kFieldSlack = 1e-8;  // [rad]
+
+// Brown's tangential terms on m = (n_x, n_y) / (1 + n_z).
+struct Decentring {
+  Eigen::Vector2d d = Eigen::Vector2d::Zero();
+
+  Eigen::Vector2d shift(const Eigen::Vector2d& m) const {
+    const double mm = m.squaredNorm();
+    const double md = 2.0 * m.dot(d.reverse());
+    // (2 d1 x y + d2 (r^2 + 2 x^2), d1 (r^2 + 2 y^2) + 2 d2 x y)
+    return Eigen::Vector2d(d[1] * mm, d[0] * mm) + m * md;
+  }
+  Eigen::Matrix2d jacobian(const Eigen::Vector2d& m) const {
+    const Eigen::Vector2d e = d.reverse();
+    Eigen::Matrix2d out = 2.0 * (e * m.transpose() + m * e.transpose());
+    out.diagonal().array() += 1.0 + 2.0 * m.dot(e);
+    return out;
+  }
+  static Eigen::Matrix2d byParameters(const Eigen::Vector2d& m) {
+    const double mm = m.squaredNorm();
+    const double xy = 2.0 * m.x() * m.y();
+    Eigen::Matrix2d out;
+    out << xy, mm + 2.0 * m.x() * m.x(), mm + 2.0 * m.y() * m.y(), xy;
+    return out;
+  }
+};
+
+Eigen::Vector2d toPlane(const Eigen::Vector3d& n) { return n.head<2>() / (1.0 + n.z()); }
+
+Eigen::Vector3d fromPlane(const Eigen::Vector2d& m) {
+  const double mm = m.squaredNorm();
+  return Eigen::Vector3d(2.0 * m.x(), 2.0 * m.y(), 1.0 - mm) / (1.0 + mm);
+}
+
+Jacobian23 toPlaneJacobian(const Eigen::Vector3d& n) {
+  const double k = 1.0 / (1.0 + n.z());
+  Jacobian23 out;
+  out << k, 0.0, -n.x() * k * k, 0.0, k, -n.y() * k * k;
+  return out;
+}
+
+Jacobian32 fromPlaneJacobian(const Eigen::Vector2d& m) {
+  const double k = 1.0 / (1.0 + m.squaredNorm());
+  Jacobian32 out;
+  out.topRows<2>() = 2.0 * k * (Eigen::Matrix2d::Identity() - 2.0 * k * m * m.transpose());
+  out.row(2) = -4.0 * k * k * m.transpose();
+  return out;
+}
+
+struct Extras {
+  bool affinity = false;
+  bool decentring = false;
+  int size() const { return (affinity ? 2 : 0) + (decentring ? 2 : 0); }
+};
+
+template <typename Surface>
+class CentralLens final : public LensModel {
+ public:
+  CentralLens(const Surface& surface, Extras extras) : surface_(surface), extras_(extras) {}
+
+  std::string_view model() const override { return Surface::kModel; }
+  double maxTheta() const override { return max_theta_; }
+  const Surface& surface() const { return surface_; }
+  const Extras& extras() const { return extras_; }
+
+  std::optional<Eigen::Vector2d> project(const Eigen::Vector3d& bearing, Jacobian23* d_bearing,
+                                         JacobianParams* d_parameters) const override {
+    double square = bearing.squaredNorm();
+    double scale = 1.0;
+    if (!(square > 1e-200 && square < 1e200)) {
+      const double largest = bearing.cwiseAbs().maxCoeff();
+      if (!(largest > 0.0) || !bearing.allFinite()) return std::nullopt;
+      scale = 1.0 / largest;
+      if (!std::isfinite(scale)) return std::nullopt;
+      square = (bearing * scale).squaredNorm();
+    }
+    const double inverse = 1.0 / std::sqrt(square);
+    const Eigen::Vector3d n = (bearing * scale) * inverse;
+    if (!(n.z() >= cos_max_)) return std::nullopt;
+
+    Eigen::Vector2d xy;
+    Jacobian23 d_n;
+    std::array<double, 2 * kMaxSize> d_surface;
+    double* const d_p = d_parameters != nullptr ? d_surface.data() : nullptr;
+    if (!extras_.decentring) {
+      if (!surface_.project(n, xy, d_bearing != nullptr ? &d_n : nullptr, d_p)) {
+        return std::nullopt;
+      }
+    } else {
+      const Eigen::Vector2d m = toPlane(n);
+      const Eigen::Vector2d m_bent = m + decentring_.shift(m);
+      const bool need_d_n = d_bearing != nullptr || d_parameters != nullptr;
+      if (!surface_.project(fromPlane(m_bent), xy, need_d_n ? &d_n : nullptr, d_p)) {
+        return std::nullopt;
+      }
+      if (need_d_n) {
+        const Eigen::Matrix2d d_m = d_n * fromPlaneJacobian(m_bent);
+        if (d_parameters != nullptr) {
+          d_parameters->resize(2, size());
+          d_parameters->template rightCols<2>() = linear_ * d_m * Decentring::byParameters(m);
+        }
+        if (d_bearing != nullptr) {
+          d_n = d_m * decentring_.jacobian(m) * toPlaneJacobian(n);
+          d_n -= (d_n * n) * n.transpose();
+        }
+      }
+    }
+    if (d_bearing != nullptr) *d_bearing = linear_ * d_n * (inverse * scale);
+    if (d_parameters != nullptr) {
+      const int n_surface = surface_.size();
+      d_parameters->resize(2, size());
+      d_parameters->template leftCols<2>().setIdentity();
+      d_parameters->middleCols(2, n_surface) =
+          linear_ * Eigen::Map<const Eigen::Matrix2Xd>(d_surface.data(), 2, n_surface);
+      if (extras_.affinity) {
+        d_parameters->template middleCols<2>(2 + n_surface) << xy.x(), xy.y(), 0.0, 0.0;
+      }
+    }
+    return center_ + linear_ * xy;
+  }
+
+  std::optional<Eigen::Vector3d> unproject(const Eigen::Vector2d& pixel,
+                                           Jacobian32* d_pixel) const override {
+    const Eigen::Vector2d xy = inverse_linear_ * (pixel - center_);
+    Eigen::Vector3d n;
+    Jacobian32 d_xy;
+    if (!surface_.unproject(xy, n, d_pixel != nullptr ? &d_xy : nullptr)) return std::nullopt;
+    if (extras_.decentring) {
+      if (!(1.0 + n.z() > 1e-12)) return std::nullopt;
+      const Eigen::Vector2d m_bent = toPlane(n);
+      const auto m = straighten(m_bent);
+      if (!m) return std::nullopt;
+      if (d_pixel != nullptr) {
+        d_xy =
+            fromPlaneJacobian(*m) * decentring_.jacobian(*m).inverse() * toPlaneJacobian(n) * d_xy;
+      }
+      n = fromPlane(*m);
+    }
+    if (!(n.z() >= cos_max_)) return std::nullopt;
+    if (d_pixel != nullptr) *d_pixel = d_xy * inverse_linear_;
+    return n;
+  }
+
+  std::optional<double> surfaceHeight(double x, double y) const override {
+    Eigen::Vector3d n;
+    if (!surface_.unproject({x, y}, n, nullptr) || !(n.z() >= cos_max_)) return std::nullopt;
+    return surface_.height({x, y});
+  }
+
+  Eigen::VectorXd parameters() const override {
+    Eigen::VectorXd out(size());
+    out.head<2>() = center_;
+    surface_.get(out.data() + 2);
+    int i = 2 + surface_.size();
+    if (extras_.affinity) {
+      out[i++] = linear_(0, 0) - 1.0;
+      out[i++] = linear_(0, 1);
+      // 1 + p loses digits of a small p.
+      out[i - 2] = p_;
+    }
+    if (extras_.decentring) out.tail<2>() = decentring_.d;
+    return out;
+  }
+
+  std::vector<std::string> parameterNames() const override {
+    std::vector<std::string> out{"cx", "cy"};
+    for (auto& name : surface_.names()) out.push_back(std::move(name));
+    if (extras_.affinity) out.insert(out.end(), {"p", "q"});
+    if (extras_.decentring) out.insert(out.end(), {"d1", "d2"});
+    return out;
+  }
+
+  LensPtr withParameters(const Eigen::VectorXd& parameters,
+                         std::optional<double> max_theta) const override {
+    if (parameters.size() != size()) return nullptr;
+    double field = max_theta.value_or(max_theta_);
+    if (std::is_same_v<Surface, RadialSurface<SphericalProfile>>) {
+      field = std::min(field, SphericalProfile::kMaxTheta);
+    }
+    if (!(field > 0.0) || !(field <= kLargestField) || !parameters.allFinite()) return nullptr;
+    if (!(parameters.head<2>().cwiseAbs().maxCoeff() <= kMaxCenter)) return nullptr;
+
+    auto out = std::make_shared<CentralLens>(surface_, extras_);
+    out->center_ = parameters.head<2>();
+    int i = 2 + surface_.size();
+    if (extras_.affinity) {
+      out->p_ = parameters[i];
+      const double q = parameters[i + 1];
+      if (!(std::abs(out->p_) <= 0.9) || !(std::abs(q) <= 10.0)) return nullptr;
+      out->linear_ << 1.0 + out->p_, q, 0.0, 1.0;
+      out->inverse_linear_ << 1.0, -q, 0.0, 1.0 + out->p_;
+      out->inverse_linear_ /= 1.0 + out->p_;
+    }
+    double bent_field = field;
+    if (extras_.decentring) {
+      out->decentring_.d = parameters.tail<2>();
+      // The Jacobian of the shift is symmetric with eigenvalues of at least 1 - 6 |d| |m|: while
+      // that is positive over the disc of the field, the shift is one-to-one there.
+      out->plane_radius_ = std::tan(0.5 * field);
+      const double bend = out->decentring_.d.norm() * out->plane_radius_;
+      if (!(6.0 * bend < 0.95)) return nullptr;
+      bent_field = 2.0 * std::atan(out->plane_radius_ * (1.0 + 3.0 * bend));
+    }
+    const auto surface = surface_.with(parameters.data() + 2, bent_field + kFieldSlack);
+    if (!surface) return nullptr;
+    out->surface_ = *surface;
+    out->max_theta_ = field;
+    out->cos_max_ = std::cos(field) - kCosSlack;
+    return out;
+  }
+
+ private:
+  static constexpr int kMaxSize = 40;
+
+  int size() const { return 2 + surface_.size() + extras_.size(); }
+
+  // The inverse of m + shift(m), by Newton with halved steps: within the field the solution is the
+  // only one, and outside none is wanted.
+  std::optional<Eigen::Vector2d> straighten(const Eigen::Vector2d& bent) const {
+    const double border = plane_radius_ * (1.0 + 1e-9);
+    const auto inside = [&](const Eigen::Vector2d& m) -> Eigen::Vector2d {
+      const double length = m.norm();
+      return length <= border ? m : Eigen::Vector2d(m * (border / length));
+    };
+    Eigen::Vector2d m = inside(bent - decentring_.shift(bent));
+    Eigen::Vector2d error = m + decentring_.shift(m) - bent;
+    for (int i = 0; i < 50; ++i) {
+      const double size = error.norm();
+      if (size <= 1e-16 * (1.0 + bent.norm())) return m;
+      const Eigen::Vector2d step = decentring_.jacobian(m).inverse() * error;
+      double part = 1.0;
+      for (;; part *= 0.5) {
+        if (part < 1e-3) {
+          // No further descent: converged to rounding, or stuck at the border of the field.
+          if (size <= 1e-13 * (1.0 + bent.norm())) return m;
+          return std::nullopt;
+        }
+        const Eigen::Vector2d next = inside(m - part * step);
+        const Eigen::Vector2d next_error = next + decentring_.shift(next) - bent;
+        if (next_error.norm() < size) {
+          m = next;
+          error = next_error;
+          break;
+        }
+      }
+    }
+    return std::nullopt;
+  }
+
+  Surface surface_;
+  Extras extras_;
+  Eigen::Vector2d center_ = Eigen::Vector2d::Zero();
+  Eigen::Matrix2d linear_ = Eigen::Matrix2d::Identity();  // sensor coordinates to pixel
+  Eigen::Matrix2d inverse_linear_ = Eigen::Matrix2d::Identity();
+  double p_ = 0.0;
+  Decentring decentring_;
+  double plane_radius_ = 0.0;  // tan(max_theta / 2)
+  double max_theta_ = 0.0;
+  double cos_max_ = 1.0;
+};
+
+using SphericalLens = CentralLens<RadialSurface<SphericalProfile>>;
+using QuadricLens = CentralLens<QuadricSurface>;
+using ConicLens = CentralLens<RadialSurface<ConicProfile>>;
+using AsphereLens = CentralLens<RadialSurface<AsphereProfile>>;
+using SplineLens = CentralLens<RadialSurface<SplineProfile>>;
+
+std::string known() {
+  std::string out;
+  for (const std::string& name : lensModelNames()) out += (out.empty() ? "" : ", ") + name;
+  return out;
+}
+
+// A lens of the structure that carries no numbers yet.
+LensPtr prototype(const LensStructure& structure, double span) {
+  const Extras extras{structure.affinity, structure.decentring};
+  const std::string& model = structure.model;
+  if (structure.decentring && model != "asphere" && model != "spline") {
+    throw Error("lens model " + printable(model) +
+                " cannot carry decentring, expected asphere or spline");
+  }
+  if (model == "spherical")
+    return std::make_shared<SphericalLens>(RadialSurface<SphericalProfile>(), extras);
+  if (model == "quadric") return std::make_shared<QuadricLens>(QuadricSurface(), extras);
+  if (model == "conic") return std::make_shared<ConicLens>(RadialSurface<ConicProfile>(), extras);
+  if (model == "asphere") {
+    if (structure.even_terms < 0 || structure.even_terms > AsphereProfile::kMaxTerms) {
+      throw Error("an asphere with " + std::to_string(structure.even_terms) +
+                  " even terms, expected 0 to 3");
+    }
+    return std::make_shared<AsphereLens>(
+        RadialSurface<AsphereProfile>(AsphereProfile(structure.even_terms)), extras);
+  }
+  if (model == "spline") {
+    if (structure.knots < SplineProfile::kMinKnots || structure.knots > SplineProfile::kMaxKnots) {
+      throw Error("a spline with " + std::to_string(structure.knots) + " knots, expected 4 to 32");
+    }
+    return std::make_shared<SplineLens>(
+        RadialSurface<SplineProfile>(SplineProfile(structure.knots, span)), extras);
+  }
+  throw Error("unknown lens model " + printable(model) + ", expected one of " + known());
+}
+
+}  // namespace
+
+const std::vector<std::string>& lensModelNames() {
+  static const std::vector<std::string> names{"spherical", "quadric", "conic", "asphere", "spline"};
+  return names;
+}
+
+LensPtr makeLens(const LensStructure& structure, const Eigen::Vector2d& center, double focal_px,
+                 double max_theta) {
+  if (!(max_theta > 0.0) || !(max_theta <= kLargestField)) {
+    throw Error("a half field of view of " + formatNumber(max_theta) +
+                " rad, expected more than 0 and less than pi");
+  }
+  if (!(focal_px > 0.0) || !std::isfinite(focal_px) || !center.allFinite()) {
+    throw Error("a focal length of " + formatNumber(focal_px) + " px about (" +
+                formatNumber(center.x()) + ", " + formatNumber(center.y()) +
+                "), expected a positive length and finite numbers");
+  }
+  const LensPtr bare = prototype(structure, max_theta);
+  double field = max_theta;
+  if (structure.model == "spherical") field = std::min(field, SphericalProfile::kMaxTheta);
+
+  // Start with a surface that is one-to-one over any field.
+  Eigen::VectorXd parameters = Eigen::VectorXd::Zero(bare->parameterNames().size());
+  parameters.head<2>() = center;
+  int size = 0;
+  if (structure.model == "spherical") {
+    size = 1;
+    parameters[2] = focal_px;
+  } else if (structure.model == "quadric") {
+    size = 3;
+    parameters[2] = focal_px;
+    parameters[3] = parameters[4] = 2.0 * std::sqrt(focal_px);
+  } else if (structure.model == "spline") {
+    for (int i = 1; i <= structure.knots; ++i) {
+      parameters[1 + i] = focal_px * max_theta * i / structure.knots;
+    }
+  } else {
+    size = 3 + (structure.model == "asphere" ? structure.even_terms : 0);
+    parameters.segment<3>(2) << focal_px, 0.5, 1.0;
+  }
+  LensPtr lens = bare->withParameters(parameters, field);
+  if (lens == nullptr) {
+    throw Error("no " + printable(structure.model) + " lens with a focal length of " +
+                formatNumber(focal_px) + " px about (" + formatNumber(center.x()) + ", " +
+                formatNumber(center.y()) + ")");
+  }
+  if (size == 0) return lens;  // the spline is r = f theta already
+
+  std::vector<Eigen::Vector3d> bearings;
+  std::vector<Eigen::Vector2d> pixels;
+  constexpr int kSamples = 24;
+  for (int i = 1; i <= kSamples; ++i) {
+    const double theta = field * i / kSamples;
+    for (const int axis : {0, 1}) {
+      const Eigen::Vector2d e = Eigen::Vector2d::Unit(axis);
+      bearings.emplace_back(std::sin(theta) * e.x(), std::sin(theta) * e.y(), std::cos(theta));
+      pixels.push_back(center + focal_px * theta * e);
+    }
+  }
+  LensFitOptions options;
+  options.first_parameter = 2;
+  options.parameters = size;
+  options.max_iterations = 50;
+  return fitLens(*lens, bearings, pixels, options).lens;
+}
+
+LensStructure structureOf(const LensModel& lens) {
+  LensStructure out;
+  out.model = std::string(lens.model());
+  out.affinity = false;
+  const auto extras = [&](const Extras& e) {
+    out.affinity = e.affinity;
+    out.decentring = e.decentring;
+  };
+  if (const auto* spherical = dynamic_cast<const SphericalLens*>(&lens)) {
+    extras(spherical->extras());
+  } else if (const auto* quadric = dynamic_cast<const QuadricLens*>(&lens)) {
+    extras(quadric->extras());
+  } else if (const auto* conic = dynamic_cast<const ConicLens*>(&lens)) {
+    extras(conic->extras());
+  } else if (const auto* asphere = dynamic_cast<const AsphereLens*>(&lens)) {
+    extras(asphere->extras());
+    out.even_terms = asphere->surface().terms();
+  } else if (const auto* spline = dynamic_cast<const SplineLens*>(&lens)) {
+    extras(spline->extras());
+    out.knots = spline->surface().size();
+  }
+  return out;
+}
+
+NamedParameters namedParameters(const LensModel& lens) {
+  NamedParameters out;
+  const Eigen::VectorXd values = lens.parameters();
+  const std::vector<std::string> names = lens.parameterNames();
+  std::size_t i = 2;
+  if (const auto* spline = dynamic_cast<const SplineLens*>(&lens)) {
+    out.emplace_back("span", std::vector<double>{spline->surface().span()});
+    const int n = spline->surface().size();
+    out.emplace_back("radii", std::vector<double>(values.data() + 2, values.data() + 2 + n));
+    i += n;
+  }
+  for (; i < names.size(); ++i) out.emplace_back(names[i], std::vector<double>{values[i]});
+  return out;
+}
+
+LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
+                 const std::map<std::string, std::vector<double>>& parameters, double max_theta,
+                 std::string_view source) {
+  const std::string place = "lens_surface.parameters";
+  LensStructure structure;
+  structure.model = std::string(model);
+  const auto& models = lensModelNames();
+  if (std::find(models.begin(), models.end(), structure.model) == models.end()) {
+    throw InputError(source, "lens_surface.model",
+                     "is \"" + printable(model) + "\", expected one of " + known());
+  }
+  const auto given = [&](const char* name) { return parameters.count(name) != 0; };
+  structure.affinity = given("p") || given("q");
+  structure.decentring = given("d1") || given("d2");
+  if (structure.decentring && model != "asphere" && model != "spline") {
+    throw InputError(source, place + (given("d1") ? ".d1" : ".d2"),
+                     "is given, but a " + structure.model + " surface has no decentring");
+  }
+  if (given("a4")) structure.even_terms = 1;
+  if (given("a6")) structure.even_terms = 2;
+  if (given("a8")) structure.even_terms = 3;
+  const auto number = [&](const std::string& name, std::optional<double> fallback) {
+    const auto found = parameters.find(name);
+    if (found == parameters.end()) {
+      if (fallback) return *fallback;
+      throw InputError(source, place + "." + name,
+                       "is missing, a " + structure.model + " surface needs it");
+    }
+    if (found->second.size() != 1) {
+      throw InputError(
+          source, place + "." + name,
+          "has " + std::to_string(found->second.size()) + " numbers, expected a single one");
+    }
+    return found->second[0];
+  };
+  double span = max_theta;
+  std::vector<double> radii;
+  if (model == "spline") {
+    const auto found = parameters.find("radii");
+    if (found == parameters.end()) {
+      throw InputError(source, place + ".radii", "is missing, a spline surface needs it");
+    }
+    radii = found->second;
+    if (radii.size() < SplineProfile::kMinKnots || radii.size() > SplineProfile::kMaxKnots) {
+      throw InputError(source, place + ".radii",
+                       "has " + std::to_string(radii.size()) + " numbers, expected 4 to 32");
+    }
+    structure.knots = static_cast<int>(radii.size());
+    span = number("span", std::nullopt);
+    if (!(span > 0.0) || !(span <= kLargestField)) {
+      throw InputError(source, place + ".span",
+                       "is " + formatNumber(span) + ", expected radians in (0, pi)");
+    }
+  }
+  const LensPtr bare = prototype(structure, span);
+  const std::vector<std::string> names = bare->parameterNames();
+  for (const auto& [name, values] : parameters) {
+    const bool known_name = model == "spline" && (name == "radii" || name == "span")
+                                ? true
+                                : std::find(names.begin() + 2, names.end(), name) != names.end() &&
+                                      (model != "spline" || name[0] != 'r');
+    if (!known_name) {
+      throw InputError(source, place + "." + name,
+                       "is no parameter of a " + structure.model + " surface");
+    }
+    for (const double value : values) {
+      if (!std::isfinite(value)) {
+        throw InputError(source, place + "." + name,
+                         "is " + formatNumber(value) + ", expected a finite number");
+      }
+    }
+  }
+  if (!(max_theta > 0.0) || !(max_theta <= kLargestField)) {
+    throw InputError(source, "lens_surface.max_theta",
+                     "is " + formatNumber(max_theta) + ", expected radians in (0, pi)");
+  }
+  if (model == "spherical" && max_theta > SphericalProfile::kMaxTheta) {
+    throw InputError(source, "lens_surface.max_theta",
+                     "is " + formatNumber(max_theta) +
+                         ", but a spherical surface ends before pi/2 (at " +
+                         formatNumber(SphericalProfile::kMaxTheta) + ")");
+  }
+  Eigen::VectorXd values(names.size());
+  values.head<2>() = center;
+  for (std::size_t i = 2; i < names.size(); ++i) {
+    if (i - 2 < radii.size()) {
+      values[i] = radii[i - 2];
+      continue;
+    }
+    const bool neutral = names[i] == "p" || names[i] == "q" || names[i] == "d1" || names[i] == "d2";
+    values[i] = number(names[i], neutral ? std::optional<double>(0.0) : std::nullopt);
+  }
+  LensPtr lens = bare->withParameters(values, max_theta);
+  if (lens == nullptr) {
+    throw InputError(source, place,
+                     "give a surface that is not one-to-one (radius rising with the angle, lengths "
+                     "positive) over the field of lens_surface.max_theta " +
+                         formatNumber(max_theta) + " rad");
+  }
+  return lens;
+}
+
+}  // namespace omnister
