@@ -5,8 +5,8 @@
 
 namespace omnister::sim {
 
-/// A well-mixed 64-bit value of a counter (Steele, Lea and Flood 2014, SplitMix64): the same for a pixel
-/// whichever thread asks.
+/// A well-mixed 64-bit value of a counter (Steele, Lea and Flood 2014, SplitMix64): the same for a
+/// pixel whichever thread asks.
 inline std::uint64_t mix(std::uint64_t value) {
   value += 0x9e3779b97f4a7c15u;
   value = (value ^ (value >> 30)) * 0xbf58476d1ce4e5b9u;

@@ -27,30 +27,31 @@ static_assert(kApron <= kBatch);
 /// Surfaces that stand steeper than this are sampled finely even by the adaptive way.
 constexpr float kSteep = 0.35f;
 
-/// A surface as one camera sees it: in the surface's own frame, with the camera's centre at `origin`.
+/// A surface as one camera sees it: in the surface's own frame, with the camera's centre at
+/// `origin`.
 struct View {
   const Surface* surface = nullptr;
-  Eigen::Matrix3f rotation;     // rays of the camera into the surface's frame
-  Eigen::Vector3f origin;       // camera centre in the surface's frame [m]
-  Eigen::Vector3f light;        // lamp in the surface's frame [m]
+  Eigen::Matrix3f rotation;  // rays of the camera into the surface's frame
+  Eigen::Vector3f origin;    // camera centre in the surface's frame [m]
+  Eigen::Vector3f light;     // lamp in the surface's frame [m]
   Eigen::Vector3f half;
   Eigen::Vector2f middle;
-  Eigen::Vector3f center;       // of the bounding sphere, in the camera's frame [m]
-  float radius = 0.0f;          // of it; infinite for endless planes [m]
+  Eigen::Vector3f center;  // of the bounding sphere, in the camera's frame [m]
+  float radius = 0.0f;     // of it; infinite for endless planes [m]
 };
 
 /// Rays of one batch in the camera's frame, and what they hit.
 struct Rays {
   int n = 0;
   std::array<float, kBatch> x, y, z;
-  std::array<float, kBatch> angle;      // width of the sample [rad]
-  std::array<float, kBatch> range;      // infinite: nothing hit
-  std::array<std::int16_t, kBatch> hit; // index into the views, -1: nothing
+  std::array<float, kBatch> angle;       // width of the sample [rad]
+  std::array<float, kBatch> range;       // infinite: nothing hit
+  std::array<std::int16_t, kBatch> hit;  // index into the views, -1: nothing
 };
 
 struct Shades {
   std::array<float, kBatch> red, green, blue;
-  std::array<float, kBatch> cosine;     // between ray and normal, 0 to 1; 1 where nothing was hit
+  std::array<float, kBatch> cosine;  // between ray and normal, 0 to 1; 1 where nothing was hit
   std::array<std::int8_t, kBatch> face;
 };
 
@@ -170,9 +171,15 @@ class Frame {
       if (!maySee(cone, views_[i])) continue;
       const int index = static_cast<int>(i);
       switch (views_[i].surface->kind) {
-        case Surface::Kind::kPlane: hitPlane(views_[i], index, rays); break;
-        case Surface::Kind::kBox: hitBox(views_[i], index, rays); break;
-        case Surface::Kind::kSphere: hitSphere(views_[i], index, rays); break;
+        case Surface::Kind::kPlane:
+          hitPlane(views_[i], index, rays);
+          break;
+        case Surface::Kind::kBox:
+          hitBox(views_[i], index, rays);
+          break;
+        case Surface::Kind::kSphere:
+          hitSphere(views_[i], index, rays);
+          break;
       }
     }
   }
@@ -255,8 +262,8 @@ class Frame {
       const float cosine = std::min(std::abs(normal.dot(ray)), 1.0f);
       width[i] = rays.range[k] * rays.angle[k] / std::max(cosine, 0.02f);
       const Eigen::Vector3f to_light = view.light - point;
-      lit[i] = ambient + (1.0f - ambient) * std::abs(normal.dot(to_light)) /
-                             std::max(to_light.norm(), 1e-6f);
+      lit[i] = ambient +
+               (1.0f - ambient) * std::abs(normal.dot(to_light)) / std::max(to_light.norm(), 1e-6f);
       shades.cosine[k] = cosine;
       shades.face[k] = side[i];
       sides |= 1u << side[i];
@@ -281,7 +288,8 @@ class Frame {
           ++m;
         }
         view.surface->textures[face]->evaluate({m, part_u.data(), part_v.data(), part_width.data()},
-                                               part_red.data(), part_green.data(), part_blue.data());
+                                               part_red.data(), part_green.data(),
+                                               part_blue.data());
         m = 0;
         for (int i = 0; i < n; ++i) {
           if (side[i] != face) continue;
@@ -316,7 +324,8 @@ const std::vector<float>& normalQuantiles() {
       const double wanted = (i + 0.5) / kCount;
       for (int step = 0; step < 50; ++step) {
         const double error = 0.5 * std::erfc(-z / std::sqrt(2.0)) - wanted;
-        const double change = error / (std::exp(-0.5 * z * z) / std::sqrt(2.0 * 3.14159265358979324));
+        const double change =
+            error / (std::exp(-0.5 * z * z) / std::sqrt(2.0 * 3.14159265358979324));
         z -= std::clamp(change, -0.5, 0.5);
         if (std::abs(change) < 1e-12) break;
       }
@@ -340,7 +349,8 @@ void checkOptions(const RenderOptions& options) {
     throw Error("supersampling is " + std::to_string(options.supersampling) + ", expected 1 to 16");
   }
   if (!(options.noise_sigma >= 0.0 && options.noise_sigma <= 255.0)) {
-    throw Error("noise is " + std::to_string(options.noise_sigma) + ", expected 0 to 255 grey levels");
+    throw Error("noise is " + std::to_string(options.noise_sigma) +
+                ", expected 0 to 255 grey levels");
   }
   if (!(options.vignetting >= 0.0 && options.vignetting <= 1.0)) {
     throw Error("vignetting is " + std::to_string(options.vignetting) + ", expected 0 to 1");
@@ -393,8 +403,8 @@ class Tile {
     place_.fill(-1);
     int n = 0;
     const auto take = [&](int x, int y) {
-      const std::size_t at =
-          static_cast<std::size_t>(area_.y + y + 1) * stride_ + static_cast<std::size_t>(area_.x + x + 1);
+      const std::size_t at = static_cast<std::size_t>(area_.y + y + 1) * stride_ +
+                             static_cast<std::size_t>(area_.x + x + 1);
       if (std::isnan(ray_x_[at])) return;
       place_[(y + 1) * kWide + x + 1] = static_cast<std::int16_t>(n);
       pixel_x_[n] = static_cast<std::int16_t>(x);
@@ -425,7 +435,8 @@ class Tile {
     const int last = after < 0 ? k : after;
     const float steps = static_cast<float>((before >= 0) + (after >= 0));
     if (steps == 0.0f) return Eigen::Vector3f::Zero();
-    return Eigen::Vector3f(centres_.x[last] - centres_.x[first], centres_.y[last] - centres_.y[first],
+    return Eigen::Vector3f(centres_.x[last] - centres_.x[first],
+                           centres_.y[last] - centres_.y[first],
                            centres_.z[last] - centres_.z[first]) /
            steps;
   }
@@ -440,8 +451,8 @@ class Tile {
       cone_.axis = sum.normalized();
       float least = 1.0f;
       for (int k = 0; k < centres_.n; ++k) {
-        least = std::min(least, cone_.axis.dot(Eigen::Vector3f(centres_.x[k], centres_.y[k],
-                                                               centres_.z[k])));
+        least = std::min(
+            least, cone_.axis.dot(Eigen::Vector3f(centres_.x[k], centres_.y[k], centres_.z[k])));
       }
       // The apron already holds what samples between pixels see.
       cone_.half_angle = std::acos(std::clamp(least, -1.0f, 1.0f)) + 1e-3f;
@@ -466,7 +477,8 @@ class Tile {
     const int at = (pixel_y_[k] + 1) * kWide + pixel_x_[k] + 1;
     for (const int step : {-kWide - 1, -kWide, -kWide + 1, -1, 1, kWide - 1, kWide, kWide + 1}) {
       const int other = place_[at + step];
-      if (other >= 0 && (centres_.hit[other] != centres_.hit[k] || shades_.face[other] != shades_.face[k])) {
+      if (other >= 0 &&
+          (centres_.hit[other] != centres_.hit[k] || shades_.face[other] != shades_.face[k])) {
         return true;
       }
     }
@@ -528,11 +540,13 @@ class Tile {
       const float factor = 1.0f - vignetting * (1.0f - fall_off);
       std::uint64_t random = 0;
       if (sigma > 0.0f) {
-        random = mix(stream ^ (static_cast<std::uint64_t>(y) * static_cast<std::uint64_t>(out.range.cols) +
-                               static_cast<std::uint64_t>(x)));
+        random = mix(stream ^
+                     (static_cast<std::uint64_t>(y) * static_cast<std::uint64_t>(out.range.cols) +
+                      static_cast<std::uint64_t>(x)));
       }
       const auto noise = [&](int channel) {
-        return sigma > 0.0f ? sigma * quantiles[random >> (16 * channel) & (quantiles.size() - 1)] : 0.0f;
+        return sigma > 0.0f ? sigma * quantiles[random >> (16 * channel) & (quantiles.size() - 1)]
+                            : 0.0f;
       };
       if (options.color) {
         auto& pixel = out.image.at<cv::Vec3b>(y, x);
@@ -572,16 +586,20 @@ Renderer::Renderer(const LensModel& lens, cv::Size size, int threads) : size_(si
   const std::size_t stride = static_cast<std::size_t>(size.width) + 2;
   const std::size_t rows = static_cast<std::size_t>(size.height) + 2;
   for (auto* plane : {&ray_x_, &ray_y_, &ray_z_}) plane->assign(stride * rows, kNan);
-  parallelFor(0, rows, threads, [&](std::size_t row) {
-    for (std::size_t column = 0; column < stride; ++column) {
-      const auto ray = lens.unproject({static_cast<double>(column) - 1.0, static_cast<double>(row) - 1.0});
-      if (!ray) continue;
-      const std::size_t at = row * stride + column;
-      ray_x_[at] = static_cast<float>(ray->x());
-      ray_y_[at] = static_cast<float>(ray->y());
-      ray_z_[at] = static_cast<float>(ray->z());
-    }
-  }, 8);
+  parallelFor(
+      0, rows, threads,
+      [&](std::size_t row) {
+        for (std::size_t column = 0; column < stride; ++column) {
+          const auto ray =
+              lens.unproject({static_cast<double>(column) - 1.0, static_cast<double>(row) - 1.0});
+          if (!ray) continue;
+          const std::size_t at = row * stride + column;
+          ray_x_[at] = static_cast<float>(ray->x());
+          ray_y_[at] = static_cast<float>(ray->y());
+          ray_z_[at] = static_cast<float>(ray->z());
+        }
+      },
+      8);
 }
 
 Rendering Renderer::render(const Scene& scene, const Pose& T_world_camera,
@@ -599,14 +617,15 @@ Rendering Renderer::render(const Scene& scene, const Pose& T_world_camera,
   const cv::Rect image({0, 0}, size_);
   parallelFor(0, static_cast<std::size_t>(across) * down, options.threads, [&](std::size_t i) {
     const int index = static_cast<int>(i);
-    const cv::Rect area(index % across * kTileWidth, index / across * kTileHeight, kTileWidth, kTileHeight);
+    const cv::Rect area(index % across * kTileWidth, index / across * kTileHeight, kTileWidth,
+                        kTileHeight);
     Tile(frame, ray_x_, ray_y_, ray_z_, size_.width + 2, area & image).run(options, out);
   });
   return out;
 }
 
-Rendering render(const Scene& scene, const LensModel& lens, cv::Size size, const Pose& T_world_camera,
-                 const RenderOptions& options) {
+Rendering render(const Scene& scene, const LensModel& lens, cv::Size size,
+                 const Pose& T_world_camera, const RenderOptions& options) {
   return Renderer(lens, size, options.threads).render(scene, T_world_camera, options);
 }
 

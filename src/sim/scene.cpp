@@ -42,9 +42,11 @@ class Block {
  public:
   Block(const YAML::Node& node, std::string source, std::string place)
       : source_(std::move(source)), place_(std::move(place)) {
-    if (!node.IsMap()) throw InputError(source_, place_, "is " + quoted(node) + ", expected a mapping");
+    if (!node.IsMap())
+      throw InputError(source_, place_, "is " + quoted(node) + ", expected a mapping");
     for (const auto& entry : node) {
-      if (!entry.first.IsScalar()) throw InputError(source_, place_, "has a key that is not a word");
+      if (!entry.first.IsScalar())
+        throw InputError(source_, place_, "has a key that is not a word");
       if (!values_.emplace(entry.first.Scalar(), entry.second).second) {
         fail(entry.first.Scalar(), "stands there twice");
       }
@@ -135,7 +137,8 @@ class Block {
   std::vector<double> toNumbers(const YAML::Node& value, const std::string& key, std::size_t count,
                                 double low, double high) const {
     if (!value.IsSequence() || value.size() != count) {
-      fail(key, "is " + quoted(value) + ", expected " + std::to_string(count) + " numbers in brackets");
+      fail(key,
+           "is " + quoted(value) + ", expected " + std::to_string(count) + " numbers in brackets");
     }
     std::vector<double> result;
     for (std::size_t i = 0; i < count; ++i) {
@@ -169,16 +172,18 @@ cv::Mat readPicture(Block& block, const std::filesystem::path& folder) {
   const std::string bytes = readFile(path, kMaxPictureFile);
   cv::Mat image;
   try {
-    image = cv::imdecode(cv::Mat(1, static_cast<int>(bytes.size()), CV_8UC1,
-                                 const_cast<char*>(bytes.data())),
-                         cv::IMREAD_COLOR);
+    image = cv::imdecode(
+        cv::Mat(1, static_cast<int>(bytes.size()), CV_8UC1, const_cast<char*>(bytes.data())),
+        cv::IMREAD_COLOR);
   } catch (const cv::Exception&) {
     image.release();
   }
-  if (image.empty()) block.fail("file", "'" + printable(path.string()) + "' is not a readable image");
+  if (image.empty())
+    block.fail("file", "'" + printable(path.string()) + "' is not a readable image");
   if (std::max(image.cols, image.rows) > kMaxPictureSide) {
     block.fail("file", "has " + std::to_string(image.cols) + "x" + std::to_string(image.rows) +
-                           " pixels, expected at most " + std::to_string(kMaxPictureSide) + " a side");
+                           " pixels, expected at most " + std::to_string(kMaxPictureSide) +
+                           " a side");
   }
   return image;
 }
@@ -229,7 +234,8 @@ Pose readPose(Block& block) {
   Pose pose = Pose::Identity();
   pose.translation() = block.vector("position", 1000.0);
   if (block.has("quaternion")) {
-    if (block.has("rotation")) block.fail("quaternion", "stands beside rotation, expected one of them");
+    if (block.has("rotation"))
+      block.fail("quaternion", "stands beside rotation, expected one of them");
     const auto q = block.numbers("quaternion", 4, -1e6, 1e6);
     Eigen::Quaterniond rotation(q[3], q[0], q[1], q[2]);
     if (rotation.norm() < 1e-6) block.fail("quaternion", "has no length");
@@ -261,7 +267,8 @@ class SceneReader {
     if (block.has("light")) scene->light = block.vector("light", 1000.0);
     if (block.has("textures")) {
       const YAML::Node& textures = block.node("textures", "a mapping");
-      if (!textures.IsMap()) block.fail("textures", "is " + quoted(textures) + ", expected a mapping");
+      if (!textures.IsMap())
+        block.fail("textures", "is " + quoted(textures) + ", expected a mapping");
       if (textures.size() > kMaxObjects) block.fail("textures", "are more than 1000");
       for (const auto& entry : textures) {
         if (!entry.first.IsScalar()) block.fail("textures", "has a name that is not a word");
@@ -295,7 +302,8 @@ class SceneReader {
 
   void readTextures(Block& block, bool box, Surface& surface) const {
     if (box && block.has("textures")) {
-      if (block.has("texture")) block.fail("textures", "stand beside texture, expected one of them");
+      if (block.has("texture"))
+        block.fail("textures", "stand beside texture, expected one of them");
       const YAML::Node& list = block.node("textures", "six names");
       if (!list.IsSequence() || list.size() != 6) {
         block.fail("textures", "is " + quoted(list) +
@@ -307,7 +315,8 @@ class SceneReader {
         surface.textures[i] = named(block, key, list[i].Scalar());
       }
     } else {
-      surface.textures.fill(named(block, "texture", block.text("texture", "the name of a texture")));
+      surface.textures.fill(
+          named(block, "texture", block.text("texture", "the name of a texture")));
     }
   }
 
@@ -377,7 +386,8 @@ std::optional<double> rangeTo(const Surface& surface, const Eigen::Vector3d& ori
       const double t = -origin.z() / ray.z();
       if (!(t > 0.0) || std::isinf(t)) return std::nullopt;
       const Eigen::Vector2d at = origin.head<2>() + t * ray.head<2>() - surface.middle;
-      if (std::abs(at.x()) > surface.half.x() || std::abs(at.y()) > surface.half.y()) return std::nullopt;
+      if (std::abs(at.x()) > surface.half.x() || std::abs(at.y()) > surface.half.y())
+        return std::nullopt;
       return t;
     }
     case Surface::Kind::kBox: {
@@ -438,7 +448,8 @@ ScenePtr parseScene(std::string_view text, std::string_view source,
     const YAML::Node root = YAML::Load(std::string(text));
     return std::make_shared<const Scene>(SceneReader(std::string(source), folder).read(root));
   } catch (const YAML::Exception& error) {
-    throw InputError(source, error.mark.is_null() ? "" : "line " + std::to_string(error.mark.line + 1),
+    throw InputError(source,
+                     error.mark.is_null() ? "" : "line " + std::to_string(error.mark.line + 1),
                      "is not YAML: " + error.msg);
   }
 }

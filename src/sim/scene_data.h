@@ -20,10 +20,11 @@ struct Surface {
   enum class Kind { kPlane, kBox, kSphere };
   Kind kind = Kind::kPlane;
   Pose T_world_local = Pose::Identity();
-  /// Half extent along the local axes [m]. Planes lie in x and y (z is 0) and may be infinite; a sphere
-  /// has its radius in each.
+  /// Half extent along the local axes [m]. Planes lie in x and y (z is 0) and may be infinite; a
+  /// sphere has its radius in each.
   Eigen::Vector3d half = Eigen::Vector3d::Zero();
-  /// Planes: middle of the rectangle in local coordinates (boards are not centred on their frame) [m].
+  /// Planes: middle of the rectangle in local coordinates (boards are not centred on their frame)
+  /// [m].
   Eigen::Vector2d middle = Eigen::Vector2d::Zero();
   /// One for each side of a box; planes: front (seen along +z) and back; spheres: the first.
   std::array<TexturePtr, 6> textures;

@@ -26,18 +26,20 @@ const float* lattice() {
   return values.data();
 }
 
-/// Standard deviation of lattice noise: sqrt(1/3) of its values, times that of the smooth interpolation.
+/// Standard deviation of lattice noise: sqrt(1/3) of its values, times that of the smooth
+/// interpolation.
 constexpr float kNoiseDeviation = 0.4288f;
 
 struct Octave {
   float x_u, x_v, x_0;  ///< from surface to lattice coordinates
   float y_u, y_v, y_0;
-  float spacing;        ///< [m]
+  float spacing;  ///< [m]
   float amplitude;
 };
 
 OMNISTER_CLONES
-void addOctave(const Octave& octave, const float* table, const TextureSamples& samples, float* sum) {
+void addOctave(const Octave& octave, const float* table, const TextureSamples& samples,
+               float* sum) {
   const Octave o = octave;
   const int n = samples.n;
   const float* u = samples.u;
@@ -78,7 +80,8 @@ void squeeze(int n, float scale, float* values) {
 
 class NoiseField {
  public:
-  explicit NoiseField(const NoiseParameters& noise) : contrast_(static_cast<float>(noise.contrast)) {
+  explicit NoiseField(const NoiseParameters& noise)
+      : contrast_(static_cast<float>(noise.contrast)) {
     double spacing = noise.scale;
     double amplitude = 1.0;
     double power = 0.0;
@@ -217,9 +220,12 @@ class Bricks : public Texture {
  public:
   Bricks(double width, double height, double mortar, double variation, std::uint64_t seed,
          const std::array<Color, 2>& colors)
-      : width_(static_cast<float>(width)), height_(static_cast<float>(height)),
-        half_mortar_(static_cast<float>(0.5 * mortar)), variation_(static_cast<float>(variation)),
-        seed_(mix(seed)), colors_(colors) {}
+      : width_(static_cast<float>(width)),
+        height_(static_cast<float>(height)),
+        half_mortar_(static_cast<float>(0.5 * mortar)),
+        variation_(static_cast<float>(variation)),
+        seed_(mix(seed)),
+        colors_(colors) {}
   void evaluate(const TextureSamples& samples, float* red, float* green,
                 float* blue) const override {
     for (int k = 0; k < samples.n; ++k) {
@@ -251,8 +257,11 @@ class Dots : public Texture {
  public:
   Dots(double size, double radius, double share, std::uint64_t seed,
        const std::array<Color, 2>& colors)
-      : size_(static_cast<float>(size)), radius_(static_cast<float>(radius)),
-        share_(static_cast<float>(share)), seed_(mix(seed)), colors_(colors) {}
+      : size_(static_cast<float>(size)),
+        radius_(static_cast<float>(radius)),
+        share_(static_cast<float>(share)),
+        seed_(mix(seed)),
+        colors_(colors) {}
   void evaluate(const TextureSamples& samples, float* red, float* green,
                 float* blue) const override {
     std::array<float, kBatch> dot;
@@ -264,7 +273,8 @@ class Dots : public Texture {
                             static_cast<std::uint32_t>(static_cast<std::int64_t>(column)) ^ seed_);
       const float x = samples.u[k] - column * size_ - radius_ - room * uniform(cell);
       const float y = samples.v[k] - row * size_ - radius_ - room * uniform(cell + 1);
-      const float inside = above(radius_, std::sqrt(x * x + y * y), std::max(samples.width[k], 1e-6f));
+      const float inside =
+          above(radius_, std::sqrt(x * x + y * y), std::max(samples.width[k], 1e-6f));
       dot[k] = uniform(cell + 2) < share_ ? inside : 0.0f;
     }
     blend(samples.n, colors_, dot.data(), red, green, blue);
@@ -284,7 +294,8 @@ class Picture : public Texture {
     while (std::min(levels_.back().cols, levels_.back().rows) > 1) {
       cv::Mat half;
       cv::resize(levels_.back(), half,
-                 {(levels_.back().cols + 1) / 2, (levels_.back().rows + 1) / 2}, 0, 0, cv::INTER_AREA);
+                 {(levels_.back().cols + 1) / 2, (levels_.back().rows + 1) / 2}, 0, 0,
+                 cv::INTER_AREA);
       levels_.push_back(half);
     }
   }
@@ -323,7 +334,8 @@ class Picture : public Texture {
     const cv::Vec3b* bottom = image.ptr<cv::Vec3b>(y1);
     Color color;
     for (int c = 0; c < 3; ++c) {
-      const float upper = static_cast<float>(top[x0][c]) * (1 - tx) + static_cast<float>(top[x1][c]) * tx;
+      const float upper =
+          static_cast<float>(top[x0][c]) * (1 - tx) + static_cast<float>(top[x1][c]) * tx;
       const float lower =
           static_cast<float>(bottom[x0][c]) * (1 - tx) + static_cast<float>(bottom[x1][c]) * tx;
       color[2 - c] = upper + ty * (lower - upper);

@@ -21,9 +21,10 @@ inline constexpr int kBatch = 1024;
 /// Samples on one surface. Arrays of `n` <= kBatch.
 struct TextureSamples {
   int n = 0;
-  const float* u = nullptr;      ///< surface coordinates [m]
+  const float* u = nullptr;  ///< surface coordinates [m]
   const float* v = nullptr;
-  const float* width = nullptr;  ///< width of the area that the sample stands for, on the surface [m]
+  const float* width =
+      nullptr;  ///< width of the area that the sample stands for, on the surface [m]
 };
 
 class Texture {
@@ -35,10 +36,10 @@ class Texture {
 };
 using TexturePtr = std::shared_ptr<const Texture>;
 
-/// Noise of several octaves: each is random values on a square lattice, turned against the other octaves
-/// and joined smoothly. Octaves finer than a sample's width fade out.
+/// Noise of several octaves: each is random values on a square lattice, turned against the other
+/// octaves and joined smoothly. Octaves finer than a sample's width fade out.
 struct NoiseParameters {
-  double scale = 0.4;        ///< lattice spacing of the coarsest octave [m]
+  double scale = 0.4;  ///< lattice spacing of the coarsest octave [m]
   int octaves = 7;
   double persistence = 0.8;  ///< amplitude of an octave over that of the next coarser one
   double contrast = 1.0;     ///< 0 to 1
@@ -64,9 +65,9 @@ TexturePtr makeGrain(TexturePtr base, const NoiseParameters& noise);
 /// A calibration board in the target's own coordinates, and how far its pattern reaches.
 struct BoardTexture {
   TexturePtr texture;
-  Eigen::Vector2d low;   ///< corner of the pattern without margin [m]
+  Eigen::Vector2d low;  ///< corner of the pattern without margin [m]
   Eigen::Vector2d high;
-  double margin = 0.0;   ///< white that detectors want around it [m]
+  double margin = 0.0;  ///< white that detectors want around it [m]
 };
 /// @param dark @param light grey levels
 /// @throws Error for a target that cannot be drawn

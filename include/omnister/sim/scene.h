@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 /// @file Scenes to render: textured planes, boxes, spheres and calibration boards, from YAML.
 ///
-/// Format, version 1. Lengths in metres, angles in degrees, colours as [red, green, blue] of 0 to 255.
-/// The world frame has the axes of an optical frame: x right, y down, z forward, so that a camera at the
-/// identity pose looks along +z. Unknown keys are refused.
+/// Format, version 1. Lengths in metres, angles in degrees, colours as [red, green, blue] of 0 to
+/// 255. The world frame has the axes of an optical frame: x right, y down, z forward, so that a
+/// camera at the identity pose looks along +z. Unknown keys are refused.
 ///
 ///     version: 1
 ///     background: [150, 170, 190]      # where a ray meets nothing
-///     ambient: 0.6                     # 0 to 1: light from all around; the rest comes from the lamp
-///     light: [0, -2, 1]                # the lamp's position; faces square to it are brightest
-///     textures:                        # by name
+///     ambient: 0.6                     # 0 to 1: light from all around; the rest comes from the
+///     lamp light: [0, -2, 1]                # the lamp's position; faces square to it are
+///     brightest textures:                        # by name
 ///       wall:  {type: noise, colors: [[60, 50, 40], [220, 215, 200]], scale: 0.4, octaves: 7,
 ///               persistence: 0.8, contrast: 1, seed: 3}
 ///       plain: {type: solid, color: [200, 200, 200]}
@@ -27,10 +27,11 @@
 ///       - {type: board, target: {type: checkerboard, cols: 8, rows: 6, square_m: 0.03},
 ///          position: [0, 0, 1], rotation: [0, 0, 0], margin: 0.03, dark: 20, light: 235}
 ///
-/// `position` is the centre of a plane, box or sphere, and the frame of the target (its first point) of a
-/// board. `rotation: [x, y, z]` turns about the fixed x, then y, then z axis; `quaternion: [x, y, z, w]`
-/// may stand instead. A plane spans its own x and y; without `size` it is infinite. A box takes
-/// `textures: [left, right, top, bottom, near, far]` (-x, +x, -y, +y, -z, +z) in place of `texture`.
+/// `position` is the centre of a plane, box or sphere, and the frame of the target (its first
+/// point) of a board. `rotation: [x, y, z]` turns about the fixed x, then y, then z axis;
+/// `quaternion: [x, y, z, w]` may stand instead. A plane spans its own x and y; without `size` it
+/// is infinite. A box takes `textures: [left, right, top, bottom, near, far]` (-x, +x, -y, +y, -z,
+/// +z) in place of `texture`.
 #pragma once
 
 #include <Eigen/Core>

@@ -8,8 +8,8 @@
 
 namespace omnister::test {
 
-/// r = f theta about the centre: written down directly, so that tests of the renderer rest on no fitted
-/// surface.
+/// r = f theta about the centre: written down directly, so that tests of the renderer rest on no
+/// fitted surface.
 class EquidistantLens : public LensModel {
  public:
   EquidistantLens(const Eigen::Vector2d& center, double focal_px, double max_theta)
