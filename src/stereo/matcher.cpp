@@ -2,6 +2,7 @@
 #include "omnister/stereo/matcher.h"
 
 #include "omnister/common/error.h"
+#include "omnister/stereo/sweep_matcher.h"
 #include "omnister/stereo/thesis_matcher.h"
 
 namespace omnister {
@@ -9,6 +10,7 @@ namespace omnister {
 std::unique_ptr<Matcher> makeMatcher(const std::string& name, const StereoGeometry& geometry,
                                      const MatcherOptions& options) {
   if (name == "thesis") return makeThesisMatcher(geometry, options);
+  if (name == "sweep") return makeSweepMatcher(geometry, options);
   throw Error("unknown matcher '" + printable(name) + "', expected sweep or thesis");
 }
 

@@ -1,0 +1,548 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "sweep_geometry.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <map>
+#include <opencv2/core/mat.hpp>
+#include <tuple>
+
+#include "omnister/common/error.h"
+#include "omnister/common/parallel.h"
+
+namespace omnister::sweep {
+namespace {
+
+constexpr double kPi = 3.141592653589793;
+constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
+constexpr int kNodeStep = 16;  ///< pixels or cells between exact evaluations of the lens
+constexpr int kRun = 8;        ///< cells of a run
+
+/// Weights of the cubic through four equally spaced values, at t in [0, 1) between the middle two.
+std::array<float, 4> cubicWeights(double t) {
+  return {static_cast<float>(-t * (t - 1) * (t - 2) / 6),
+          static_cast<float>((t + 1) * (t - 1) * (t - 2) / 2),
+          static_cast<float>(-(t + 1) * t * (t - 2) / 2),
+          static_cast<float>((t + 1) * t * (t - 1) / 6)};
+}
+
+/// atan2 without branches, so that loops over it become vector code; error below 2e-7 rad.
+inline float smoothAtan2(float y, float x) {
+  const float ax = std::fabs(x), ay = std::fabs(y);
+  const float large = ax > ay ? ax : ay, small = ax > ay ? ay : ax;
+  const bool far = small > 0.41421356f * large;
+  const float numerator = far ? small - large : small;
+  const float denominator = far ? small + large : large;
+  const float r = numerator / (denominator + 1e-30f);
+  const float s = r * r;
+  float angle = (((8.05374449538e-2f * s - 1.38776856032e-1f) * s + 1.99777106478e-1f) * s -
+                 3.33329491539e-1f) *
+                    s * r +
+                r;
+  angle += far ? 0.78539816f : 0.0f;
+  angle = ay > ax ? 1.57079633f - angle : angle;
+  angle = x < 0 ? 3.14159265f - angle : angle;
+  return y < 0 ? -angle : angle;
+}
+
+}  // namespace
+
+EpipolarFrame makeEpipolarFrame(const Eigen::Vector3d& t) {
+  EpipolarFrame frame;
+  frame.baseline = t.norm();
+  if (!(frame.baseline > 0) || !std::isfinite(frame.baseline))
+    throw Error(
+        "the displaced camera stands where the reference does: no baseline, so no parallax");
+  const Eigen::Vector3d e = t / frame.baseline;
+  Eigen::Vector3d m = Eigen::Vector3d::UnitZ() - e.z() * e;
+  if (m.norm() < 0.1) m = Eigen::Vector3d::UnitY() - e.y() * e;
+  m.normalize();
+  frame.basis.row(0) = e;
+  frame.basis.row(1) = m;
+  frame.basis.row(2) = e.cross(m);
+  return frame;
+}
+
+WideLens widen(const LensPtr& lens) {
+  WideLens wide{lens, std::cos(lens->maxTheta())};
+  for (const double factor : {1.12, 1.06, 1.03}) {
+    const double field = lens->maxTheta() * factor;
+    if (field >= kPi - 0.01) continue;
+    if (LensPtr wider = lens->withParameters(lens->parameters(), field)) {
+      wide.lens = wider;
+      break;
+    }
+  }
+  return wide;
+}
+
+double thetaOf(Axis axis, double a) { return axis == Axis::kAngle ? a : std::atan2(1.0, -a); }
+
+double axisOf(Axis axis, double theta) {
+  return axis == Axis::kAngle ? theta : -std::cos(theta) / std::max(std::sin(theta), 1e-6);
+}
+
+ReferenceMap makeReferenceMap(const WideLens& lens, cv::Size full_size, int level,
+                              const EpipolarFrame& frame, Axis axis, const cv::Mat& mask,
+                              int threads) {
+  const int scale = 1 << level;
+  ReferenceMap map;
+  map.size =
+      cv::Size((full_size.width + scale - 1) / scale, (full_size.height + scale - 1) / scale);
+  map.axis = axis;
+  const int width = map.size.width, height = map.size.height;
+  map.phi.assign(static_cast<std::size_t>(width) * height, kNoRay);
+  map.a.assign(static_cast<std::size_t>(width) * height, 0.0f);
+
+  const auto rayAt = [&](int x, int y) {
+    return lens.lens->unproject(Eigen::Vector2d((x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5));
+  };
+  // Rays at nodes, one beyond the cells on each side.
+  const int nodes_x = width / kNodeStep + 4, nodes_y = height / kNodeStep + 4;
+  std::vector<Eigen::Vector3f> nodes(static_cast<std::size_t>(nodes_x) * nodes_y);
+  parallelFor(0, nodes_y, threads, [&](std::size_t j) {
+    for (int i = 0; i < nodes_x; ++i) {
+      const auto ray = rayAt((i - 1) * kNodeStep, (static_cast<int>(j) - 1) * kNodeStep);
+      nodes[j * nodes_x + i] = ray ? Eigen::Vector3f((frame.basis * *ray).cast<float>())
+                                   : Eigen::Vector3f::Constant(kNaN);
+    }
+  });
+
+  std::array<std::array<float, 4>, kNodeStep> weights;
+  for (int i = 0; i < kNodeStep; ++i) weights[i] = cubicWeights(i / double(kNodeStep));
+  const Eigen::Vector3f axis_z = frame.basis.col(2).cast<float>();
+  const float cos_max = static_cast<float>(lens.cos_max_theta);
+
+  parallelFor(0, height, threads, [&](std::size_t row) {
+    const int y = static_cast<int>(row);
+    const auto& wy = weights[y % kNodeStep];
+    const Eigen::Vector3f* cell_row = &nodes[static_cast<std::size_t>(y / kNodeStep) * nodes_x];
+    std::vector<Eigen::Vector3f> line(nodes_x);
+    for (int i = 0; i < nodes_x; ++i) {
+      line[i] = wy[0] * cell_row[i] + wy[1] * cell_row[nodes_x + i] +
+                wy[2] * cell_row[2 * nodes_x + i] + wy[3] * cell_row[3 * nodes_x + i];
+    }
+    std::uint16_t* phi = &map.phi[row * width];
+    float* a = &map.a[row * width];
+    for (int x0 = 0; x0 < width; x0 += kNodeStep) {
+      const Eigen::Vector3f* p = &line[x0 / kNodeStep];
+      const int count = std::min(kNodeStep, width - x0);
+      float ex[kNodeStep], mx[kNodeStep], nx[kNodeStep];
+      const float check = p[0].x() + p[1].x() + p[2].x() + p[3].x();
+      if (std::isfinite(check)) {
+        for (int i = 0; i < kNodeStep; ++i) {
+          const auto& w = weights[i];
+          ex[i] = w[0] * p[0].x() + w[1] * p[1].x() + w[2] * p[2].x() + w[3] * p[3].x();
+          mx[i] = w[0] * p[0].y() + w[1] * p[1].y() + w[2] * p[2].y() + w[3] * p[3].y();
+          nx[i] = w[0] * p[0].z() + w[1] * p[1].z() + w[2] * p[2].z() + w[3] * p[3].z();
+        }
+      } else {
+        // Beyond what the lens can be widened to; ask it pixel by pixel.
+        for (int i = 0; i < kNodeStep; ++i) {
+          const auto ray = i < count ? rayAt(x0 + i, y) : std::nullopt;
+          const Eigen::Vector3d b =
+              ray ? Eigen::Vector3d(frame.basis * *ray) : Eigen::Vector3d::Constant(kNaN);
+          ex[i] = static_cast<float>(b.x());
+          mx[i] = static_cast<float>(b.y());
+          nx[i] = static_cast<float>(b.z());
+        }
+      }
+      float angle[kNodeStep], along[kNodeStep], z[kNodeStep];
+      for (int i = 0; i < kNodeStep; ++i) {
+        const float radius = std::sqrt(mx[i] * mx[i] + nx[i] * nx[i]);
+        angle[i] = smoothAtan2(nx[i], mx[i]);
+        along[i] = axis == Axis::kAngle ? smoothAtan2(radius, ex[i])
+                                        : -ex[i] / (radius > 1e-6f ? radius : 1e-6f);
+        z[i] = axis_z.x() * ex[i] + axis_z.y() * mx[i] + axis_z.z() * nx[i];
+      }
+      for (int i = 0; i < count; ++i) {
+        if (!(z[i] >= cos_max)) continue;  // also NaN
+        phi[x0 + i] = static_cast<std::uint16_t>(std::lround((angle[i] + kPi) * kPhiUnits));
+        a[x0 + i] = along[i];
+      }
+    }
+    if (!mask.empty()) {
+      for (int x = 0; x < width; ++x) {
+        bool seen = false;
+        for (int v = y * scale; v < std::min((y + 1) * scale, full_size.height); ++v)
+          for (int u = x * scale; u < std::min((x + 1) * scale, full_size.width); ++u)
+            seen = seen || mask.at<std::uint8_t>(v, u) != 0;
+        if (!seen) phi[x] = kNoRay;
+      }
+    }
+  });
+  return map;
+}
+
+void hypothesisRange(const HypothesisLimits& limits, double theta, double* least, double* most) {
+  const double b = limits.baseline, sine = std::max(std::sin(theta), 1e-6);
+  const auto at = [&](double range) {
+    if (limits.axis == Axis::kInverse) return 1.0 / (range * sine);
+    return std::atan2(range * sine, range * std::cos(theta) - b) - theta;
+  };
+  *least = limits.max_range > 0 ? at(limits.max_range) : 0.0;
+  if (limits.min_range > 0)
+    *most = at(limits.min_range);
+  else
+    *most = limits.axis == Axis::kInverse ? 1.0 / (4 * b * sine) : std::atan(0.25);
+  if (limits.axis == Axis::kAngle) *most = std::min(*most, kPi - theta);
+  *most = std::max(*most, *least);
+}
+
+bool localFrame(const ReferenceMap& map, int x, int y, Eigen::Vector2f* d_phi,
+                Eigen::Vector2f* d_a) {
+  constexpr int kReach = 4;
+  const auto at = [&](int u, int v, float* phi, float* a) {
+    if (u < 0 || v < 0 || u >= map.size.width || v >= map.size.height) return false;
+    const std::size_t i = static_cast<std::size_t>(v) * map.size.width + u;
+    *phi = map.phi[i];
+    *a = map.a[i];
+    return map.phi[i] != kNoRay;
+  };
+  // Derivative along (dx, dy): central where both neighbours have rays, else to one side.
+  const auto derivative = [&](int dx, int dy, float* phi, float* a) {
+    float phi0 = 0, a0 = 0, phi1 = 0, a1 = 0;
+    for (const auto& ends : {std::pair(-kReach, kReach), std::pair(0, kReach),
+                             std::pair(-kReach, 0), std::pair(0, 1), std::pair(-1, 0)}) {
+      if (!at(x + ends.first * dx, y + ends.first * dy, &phi0, &a0)) continue;
+      if (!at(x + ends.second * dx, y + ends.second * dy, &phi1, &a1)) continue;
+      float step = phi1 - phi0;
+      if (step > 32767) step -= 65534;
+      if (step < -32767) step += 65534;
+      *phi = step / static_cast<float>(kPhiUnits) / (ends.second - ends.first);
+      *a = (a1 - a0) / (ends.second - ends.first);
+      return true;
+    }
+    return false;
+  };
+  float phi_x, a_x, phi_y, a_y;
+  if (!derivative(1, 0, &phi_x, &a_x) || !derivative(0, 1, &phi_y, &a_y)) return false;
+  const float determinant = phi_x * a_y - phi_y * a_x;
+  if (!(std::fabs(determinant) > 1e-12f)) return false;
+  *d_phi = Eigen::Vector2f(a_y, -a_x) / determinant;
+  *d_a = Eigen::Vector2f(-phi_y, phi_x) / determinant;
+  return d_phi->allFinite() && d_a->allFinite();
+}
+
+Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::Size tile_size) {
+  Layout layout;
+  struct Scale {
+    double phi = 0, a = 0;  ///< pixels per radian of phi and per unit of a
+    bool left = false;      ///< theta below 90 degrees
+  };
+  std::vector<Scale> scales;
+  std::vector<double> all_phi, all_a;
+  layout.tiles_x = (map.size.width + tile_size.width - 1) / tile_size.width;
+  for (int y = 0; y < map.size.height; y += tile_size.height) {
+    for (int x = 0; x < map.size.width; x += tile_size.width) {
+      Tile tile;
+      tile.rect = cv::Rect(x, y, std::min(tile_size.width, map.size.width - x),
+                           std::min(tile_size.height, map.size.height - y));
+      Scale scale;
+      std::vector<double> phi, a;
+      for (int v = tile.rect.y; v < tile.rect.br().y; v += 6) {
+        for (int u = tile.rect.x; u < tile.rect.br().x; u += 6) {
+          Eigen::Vector2f d_phi, d_a;
+          if (map.phi[static_cast<std::size_t>(v) * map.size.width + u] == kNoRay) continue;
+          if (!localFrame(map, u, v, &d_phi, &d_a)) continue;
+          phi.push_back(d_phi.norm());
+          a.push_back(d_a.norm());
+        }
+      }
+      float a_min = std::numeric_limits<float>::max(), a_max = -a_min;
+      for (int v = tile.rect.y; v < tile.rect.br().y; ++v) {
+        for (int u = tile.rect.x; u < tile.rect.br().x; ++u) {
+          const std::size_t i = static_cast<std::size_t>(v) * map.size.width + u;
+          if (map.phi[i] == kNoRay) continue;
+          a_min = std::min(a_min, map.a[i]);
+          a_max = std::max(a_max, map.a[i]);
+        }
+      }
+      if (!phi.empty() && a_min <= a_max) {
+        const auto middle = [](std::vector<double>& v) {
+          std::nth_element(v.begin(), v.begin() + v.size() / 2, v.end());
+          return v[v.size() / 2];
+        };
+        scale.phi = middle(phi);
+        scale.a = middle(a);
+        tile.a_min = a_min;
+        tile.a_max = a_max;
+        const double theta_min = thetaOf(map.axis, a_min), theta_max = thetaOf(map.axis, a_max);
+        scale.left = theta_min + theta_max < kPi;
+        double h_min = std::numeric_limits<double>::max(), h_max = 0;
+        for (int i = 0; i <= 4; ++i) {
+          double least, most;
+          hypothesisRange(limits, theta_min + (theta_max - theta_min) * i / 4, &least, &most);
+          h_min = std::min(h_min, least);
+          h_max = std::max(h_max, most);
+        }
+        tile.h_min = static_cast<float>(h_min);
+        tile.h_max = static_cast<float>(h_max);
+        tile.band = 0;
+        all_phi.push_back(scale.phi);
+        all_a.push_back(scale.a);
+      }
+      layout.tiles.push_back(tile);
+      scales.push_back(scale);
+    }
+  }
+  if (all_phi.empty()) return layout;
+  std::sort(all_phi.begin(), all_phi.end());
+  std::sort(all_a.begin(), all_a.end());
+  // A row is 0.7 to 1.4 pixels everywhere; a column one pixel where most pixels are.
+  const double phi_reference = all_phi.back(), a_reference = all_a[all_a.size() * 6 / 10];
+  const double per_h = map.axis == Axis::kInverse ? limits.baseline : 1.0;
+  std::map<std::tuple<int, int, bool>, int> keys;
+  for (std::size_t i = 0; i < layout.tiles.size(); ++i) {
+    Tile& tile = layout.tiles[i];
+    if (tile.band < 0) continue;
+    const int p =
+        std::clamp<int>(std::lround(std::log2(phi_reference / scales[i].phi) - 0.4), 0, 8);
+    const int q = std::clamp<int>(std::lround(std::log2(a_reference / scales[i].a)), -4, 8);
+    const auto key = std::tuple(p, q, (p > 0 || q != 0) && scales[i].left);
+    const auto [found, fresh] = keys.try_emplace(key, static_cast<int>(layout.bands.size()));
+    if (fresh) {
+      Band band;
+      band.step_phi = std::exp2(p) / phi_reference;
+      band.step_h = std::exp2(q) / (a_reference * per_h);
+      layout.bands.push_back(band);
+    }
+    tile.band = found->second;
+  }
+  if (limits.hypotheses > 0) {
+    std::vector<double> columns(layout.bands.size(), 0.0);
+    for (const Tile& tile : layout.tiles) {
+      if (tile.band < 0) continue;
+      columns[tile.band] = std::max<double>(
+          columns[tile.band], (tile.h_max - tile.h_min) / layout.bands[tile.band].step_h);
+    }
+    for (std::size_t i = 0; i < columns.size(); ++i)
+      layout.bands[i].step_h *= std::max(1.0, columns[i] / limits.hypotheses);
+  }
+  return layout;
+}
+
+Grid makeGrid(const Layout& layout, const ReferenceMap& map, const EpipolarFrame& frame,
+              double column_sign_scale, const WideLens& lens, cv::Size full_size, int level,
+              const Eigen::Matrix3d& R_ref_disp, int halo, int threads) {
+  Grid grid;
+  grid.column_scale = column_sign_scale;
+  grid.bands = layout.bands;
+  const int scale = 1 << level;
+  const int width = (full_size.width + scale - 1) / scale;
+  const int height = (full_size.height + scale - 1) / scale;
+  constexpr int kSample = 4;   // pixels between those that are asked where they fall
+  constexpr int kMargin = 10;  // rows and columns kept around them
+
+  // Rows and columns that the tiles can reach.
+  std::vector<std::pair<int, int>> row_range(
+      grid.bands.size(), {std::numeric_limits<int>::max(), std::numeric_limits<int>::min()});
+  const auto visit = [&](const auto& action) {
+    for (const Tile& tile : layout.tiles) {
+      if (tile.band < 0) continue;
+      const Band& band = grid.bands[tile.band];
+      const double to_row = 1.0 / (kPhiUnits * band.step_phi), row0 = -kPi / band.step_phi;
+      const double to_column = column_sign_scale / band.step_h;
+      const cv::Rect rect = tile.rect;
+      for (int v = rect.y - halo;; v = std::min(v + kSample, rect.br().y + halo - 1)) {
+        const int y = std::clamp(v, 0, map.size.height - 1);
+        for (int u = rect.x - halo;; u = std::min(u + kSample, rect.br().x + halo - 1)) {
+          const int x = std::clamp(u, 0, map.size.width - 1);
+          const std::size_t i = static_cast<std::size_t>(y) * map.size.width + x;
+          if (map.phi[i] != kNoRay) {
+            const int row = static_cast<int>(std::lround(map.phi[i] * to_row + row0));
+            const double column = map.a[i] * to_column;
+            action(tile.band, row, static_cast<int>(std::floor(column + tile.h_min / band.step_h)),
+                   static_cast<int>(std::ceil(column + tile.h_max / band.step_h)));
+          }
+          if (u == rect.br().x + halo - 1) break;
+        }
+        if (v == rect.br().y + halo - 1) break;
+      }
+    }
+  };
+  visit([&](int band, int row, int, int) {
+    row_range[band].first = std::min(row_range[band].first, row);
+    row_range[band].second = std::max(row_range[band].second, row);
+  });
+  std::vector<std::vector<std::pair<int, int>>> spans(grid.bands.size());
+  for (std::size_t b = 0; b < grid.bands.size(); ++b) {
+    Band& band = grid.bands[b];
+    if (row_range[b].first > row_range[b].second) continue;
+    band.rows = row_range[b].second - row_range[b].first + 1 + 2 * kMargin;
+    const int row0 = row_range[b].first - kMargin;
+    band.row_scale = 1.0 / (kPhiUnits * band.step_phi);
+    band.row_offset = -kPi / band.step_phi - row0;
+    spans[b].assign(band.rows, {std::numeric_limits<int>::max(), std::numeric_limits<int>::min()});
+  }
+  visit([&](int b, int row, int lo, int hi) {
+    auto& span = spans[b][row - (row_range[b].first - kMargin)];
+    span.first = std::min(span.first, lo);
+    span.second = std::max(span.second, hi);
+  });
+
+  std::int64_t cells = 0, nodes = 0;
+  for (std::size_t b = 0; b < grid.bands.size(); ++b) {
+    Band& band = grid.bands[b];
+    band.begin.assign(band.rows, 0);
+    band.runs.assign(band.rows, 0);
+    band.origin.assign(band.rows, 0);
+    band.node.assign(band.rows, 0);
+    for (int r = 0; r < band.rows; ++r) {
+      int lo = std::numeric_limits<int>::max(), hi = std::numeric_limits<int>::min();
+      for (int s = std::max(0, r - kMargin); s <= std::min(band.rows - 1, r + kMargin); ++s) {
+        lo = std::min(lo, spans[b][s].first);
+        hi = std::max(hi, spans[b][s].second);
+      }
+      if (lo > hi) continue;
+      lo -= kMargin;
+      hi += kMargin;
+      // Runs start at multiples of eight columns, so that neighbouring rows' runs align.
+      band.begin[r] = (lo >= 0 ? lo / kRun : -((-lo + kRun - 1) / kRun)) * kRun;
+      band.runs[r] = (hi - band.begin[r] + kRun) / kRun;
+      band.origin[r] = static_cast<std::int32_t>(cells - band.begin[r]);
+      band.node[r] = static_cast<std::int32_t>(nodes);
+      cells += static_cast<std::int64_t>(band.runs[r]) * kRun;
+      nodes += band.runs[r] + 1;
+      if (cells > (std::int64_t{1} << 29))
+        throw Error(
+            "the sweep needs more than 2^29 cells: raise the least range, or lower the hypotheses");
+    }
+  }
+  grid.cells = static_cast<std::int32_t>(cells);
+  grid.x.assign(nodes, kNaN);
+  grid.y.assign(nodes, kNaN);
+  grid.mask.assign((cells + kCellSlack) / kRun, 0);
+
+  // Where the ray (phi, a) falls in the displaced image, and how deep inside its field it is.
+  const Eigen::Matrix3d turned =
+      R_ref_disp.transpose() * frame.basis.transpose();  // columns e, m, n
+  const auto rayOf = [&](const Band& band, double row, double column) {
+    const double phi = (row - band.row_offset) * band.step_phi - kPi;
+    const double theta = thetaOf(map.axis, column * band.step_h / column_sign_scale);
+    return Eigen::Vector3d(turned * Eigen::Vector3d(std::cos(theta),
+                                                    std::sin(theta) * std::cos(phi),
+                                                    std::sin(theta) * std::sin(phi)));
+  };
+  const auto legal = [&](const Band& band, double column) {
+    if (map.axis == Axis::kInverse) return true;
+    const double theta = column * band.step_h / column_sign_scale;
+    return theta >= -0.05 && theta <= kPi + 0.05;
+  };
+  const auto project = [&](const Band& band, double row, double column) {
+    Eigen::Vector2f pixel = Eigen::Vector2f::Constant(kNaN);
+    if (legal(band, column)) {
+      if (const auto p = lens.lens->project(rayOf(band, row, column)))
+        pixel = (((p->array() + 0.5) / scale) - 0.5).matrix().cast<float>();
+    }
+    return pixel;
+  };
+
+  for (Band& band : grid.bands) {
+    int lo = std::numeric_limits<int>::max(), hi = std::numeric_limits<int>::min();
+    for (int r = 0; r < band.rows; ++r) {
+      if (band.runs[r] == 0) continue;
+      lo = std::min(lo, band.begin[r]);
+      hi = std::max(hi, band.begin[r] + band.runs[r] * kRun);
+    }
+    if (lo > hi) continue;
+    const int lattice_begin = (lo >= 0 ? lo / kNodeStep : -((-lo + kNodeStep - 1) / kNodeStep)) - 1;
+    const int lattice_x = hi / kNodeStep - lattice_begin + 4;
+    const int lattice_y = band.rows / kNodeStep + 4;
+    std::vector<Eigen::Vector2f> lattice(static_cast<std::size_t>(lattice_x) * lattice_y,
+                                         Eigen::Vector2f::Constant(kNaN));
+    parallelFor(0, lattice_y, threads, [&](std::size_t j) {
+      const int row = (static_cast<int>(j) - 1) * kNodeStep;
+      int from = std::numeric_limits<int>::max(), to = std::numeric_limits<int>::min();
+      for (int r = std::max(0, row - 2 * kNodeStep);
+           r < std::min(band.rows, row + 2 * kNodeStep + 1); ++r) {
+        if (band.runs[r] == 0) continue;
+        from = std::min(from, band.begin[r]);
+        to = std::max(to, band.begin[r] + band.runs[r] * kRun);
+      }
+      for (int i = 0; i < lattice_x; ++i) {
+        const int column = (lattice_begin + i) * kNodeStep;
+        if (column < from - 2 * kNodeStep || column > to + 2 * kNodeStep) continue;
+        lattice[j * lattice_x + i] = project(band, row, column);
+      }
+    });
+    parallelFor(0, band.rows, threads, [&](std::size_t r) {
+      if (band.runs[r] == 0) return;
+      const int row = static_cast<int>(r);
+      const auto wy = cubicWeights((row % kNodeStep) / double(kNodeStep));
+      const Eigen::Vector2f* base = &lattice[static_cast<std::size_t>(row / kNodeStep) * lattice_x];
+      const auto atLattice = [&](int i) {
+        return Eigen::Vector2f(wy[0] * base[i] + wy[1] * base[lattice_x + i] +
+                               wy[2] * base[2 * lattice_x + i] + wy[3] * base[3 * lattice_x + i]);
+      };
+      float* x = &grid.x[band.node[r]];
+      float* y = &grid.y[band.node[r]];
+      for (int n = 0; n <= band.runs[r]; ++n) {
+        const int column = band.begin[r] + n * kRun;
+        const int i = (column - (lattice_begin * kNodeStep)) / kNodeStep;
+        Eigen::Vector2f pixel;
+        if ((column & (kNodeStep - 1)) == 0) {
+          pixel = atLattice(i);
+        } else {
+          pixel = 0.5625f * (atLattice(i) + atLattice(i + 1)) -
+                  0.0625f * (atLattice(i - 1) + atLattice(i + 2));
+        }
+        if (!pixel.allFinite()) pixel = project(band, row, column);
+        x[n] = pixel.x();
+        y[n] = pixel.y();
+      }
+      std::uint8_t* mask = &grid.mask[(band.origin[r] + band.begin[r]) / kRun];
+      const auto insideImage = [&](float u, float v, float margin) {
+        return u >= margin - 0.49f && v >= margin - 0.49f && u <= width - 0.51f - margin &&
+               v <= height - 0.51f - margin;
+      };
+      const auto depth = [&](double column) {
+        return legal(band, column) ? rayOf(band, row, column).z() - lens.cos_max_theta : -2.0;
+      };
+      double depth0 = depth(band.begin[r]);
+      for (int n = 0; n < band.runs[r]; ++n) {
+        const int column = band.begin[r] + n * kRun;
+        const double depth1 = depth(column + kRun);
+        if (std::isfinite(x[n]) && std::isfinite(x[n + 1]) && insideImage(x[n], y[n], 1.0f) &&
+            insideImage(x[n + 1], y[n + 1], 1.0f) && depth0 > 0.01 && depth1 > 0.01) {
+          mask[n] = 0xFF;
+        } else {
+          std::uint8_t bits = 0;
+          Eigen::Vector2f first, last;
+          int first_cell = -1, last_cell = -1;
+          for (int i = 0; i < kRun; ++i) {
+            if (depth(column + i) < 0) continue;
+            const Eigen::Vector2f p = project(band, row, column + i);
+            if (!p.allFinite() || !insideImage(p.x(), p.y(), 0.0f)) continue;
+            bits |= static_cast<std::uint8_t>(1u << i);
+            if (first_cell < 0) first = p, first_cell = i;
+            last = p, last_cell = i;
+          }
+          // A node outside the lens: the run's line is carried on from the cells inside.
+          if (bits && (!std::isfinite(x[n]) || !std::isfinite(x[n + 1]))) {
+            if (last_cell > first_cell) {
+              const Eigen::Vector2f slope = (last - first) / float(last_cell - first_cell);
+              if (!std::isfinite(x[n])) {
+                x[n] = first.x() - slope.x() * first_cell;
+                y[n] = first.y() - slope.y() * first_cell;
+              }
+              if (!std::isfinite(x[n + 1])) {
+                x[n + 1] = last.x() + slope.x() * (kRun - last_cell);
+                y[n + 1] = last.y() + slope.y() * (kRun - last_cell);
+              }
+            } else {
+              bits = 0;
+            }
+          }
+          mask[n] = bits;
+        }
+        depth0 = depth1;
+      }
+    });
+  }
+  return grid;
+}
+
+}  // namespace omnister::sweep
