@@ -184,6 +184,8 @@ class Frame {
     }
   }
 
+  bool sharp(int hit) const { return views_[hit].surface->sharp; }
+
   void shade(const Rays& rays, Shades& shades) const {
     for (int k = 0; k < rays.n; ++k) {
       shades.red[k] = scene_.background[0];
@@ -474,6 +476,7 @@ class Tile {
   /// Whether one ray does not tell what a pixel shows.
   bool needsMore(int k) const {
     if (shades_.cosine[k] < kSteep) return true;
+    const bool sharp = centres_.hit[k] >= 0 && frame_.sharp(centres_.hit[k]);
     const int at = (pixel_y_[k] + 1) * kWide + pixel_x_[k] + 1;
     for (const int step : {-kWide - 1, -kWide, -kWide + 1, -1, 1, kWide - 1, kWide, kWide + 1}) {
       const int other = place_[at + step];
@@ -481,6 +484,7 @@ class Tile {
           (centres_.hit[other] != centres_.hit[k] || shades_.face[other] != shades_.face[k])) {
         return true;
       }
+      if (sharp && other >= 0 && std::abs(shades_.red[other] - shades_.red[k]) > 4.0f) return true;
     }
     return false;
   }

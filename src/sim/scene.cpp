@@ -370,6 +370,7 @@ class SceneReader {
     surface.middle = 0.5 * (drawn.low + drawn.high);
     surface.textures.fill(makeSolid({128, 128, 128}));
     surface.textures[0] = drawn.texture;
+    surface.sharp = true;
     scene.boards.push_back(board);
   }
 

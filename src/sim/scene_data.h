@@ -28,6 +28,8 @@ struct Surface {
   Eigen::Vector2d middle = Eigen::Vector2d::Zero();
   /// One for each side of a box; planes: front (seen along +z) and back; spheres: the first.
   std::array<TexturePtr, 6> textures;
+  /// A pattern whose edges must stand exactly: never left to the filter of a texture.
+  bool sharp = false;
 
   /// Of the bounding sphere [m].
   double radius() const { return half.norm(); }

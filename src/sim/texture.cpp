@@ -61,8 +61,8 @@ void addOctave(const Octave& octave, const float* table, const TextureSamples& s
     const float sy = ty * ty * (3.0f - 2.0f * ty);
     const float top = table[y0 + x0] + sx * (table[y0 + x1] - table[y0 + x0]);
     const float bottom = table[y1 + x0] + sx * (table[y1 + x1] - table[y1 + x0]);
-    // A lattice finer than the sample cannot be seen; one of 2.5 widths is seen whole.
-    float weight = (o.spacing / width[k] - 1.0f) * (1.0f / 1.5f);
+    // A lattice of half the sample's width cannot be seen; one of 1.5 widths is seen whole.
+    float weight = o.spacing / width[k] - 0.5f;
     weight = weight < 0.0f ? 0.0f : weight;
     weight = weight > 1.0f ? 1.0f : weight;
     sum[k] += o.amplitude * weight * (top + sy * (bottom - top));
@@ -105,7 +105,7 @@ class NoiseField {
     if (samples.n == 0) return;
     const float narrowest = *std::min_element(samples.width, samples.width + samples.n);
     for (const Octave& octave : octaves_) {
-      if (octave.spacing <= narrowest) break;
+      if (octave.spacing <= 0.5f * narrowest) break;
       addOctave(octave, lattice(), samples, values);
     }
     squeeze(samples.n, scale_, values);
