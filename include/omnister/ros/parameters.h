@@ -42,6 +42,9 @@ class Parameters {
   std::string frame(const std::string& key, const std::string& fallback);
   std::vector<std::string> texts(const std::string& key);
 
+  /// A key that others read.
+  void ignore(const std::string& key) { known_.insert(key); }
+
   /// Warns of parameters that stand in the namespace and that none of the getters asked for.
   void warnUnknown() const;
 

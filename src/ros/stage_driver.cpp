@@ -1,0 +1,396 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "omnister/ros/stage_driver.h"
+
+#include <ros/console.h>
+#include <sensor_msgs/JointState.h>
+
+#include <cmath>
+
+#include "omnister/common/numbers.h"
+#include "omnister/ros/conversions.h"
+#include "omnister/ros/parameters.h"
+
+namespace omnister {
+namespace {
+
+// A device that was told to move and still reports rest after this long has not moved.
+constexpr std::chrono::milliseconds kTimeToBegin(500);
+// Position changes below this are noise, not progress [m].
+constexpr double kProgress = 1e-7;
+
+}  // namespace
+
+StageParameters loadStageParameters(const ros::NodeHandle& private_node, StageParameters p) {
+  Parameters source(private_node);
+  p.axis = source.direction("axis", p.axis);
+  p.min_m = source.number("min_m", p.min_m, -100.0, 100.0, "m");
+  p.max_m = source.number("max_m", p.max_m, -100.0, 100.0, "m");
+  if (!(p.min_m < p.max_m)) {
+    throw InputError(
+        "parameter " + private_node.resolveName("max_m"), "",
+        "is " + formatNumber(p.max_m) + ", expected above min_m (" + formatNumber(p.min_m) + " m)");
+  }
+  p.speed_mps = source.number("speed_mps", p.speed_mps, 1e-6, 10.0, "m/s");
+  p.rate_hz = source.number("rate", p.rate_hz, 20.0, 500.0, "Hz");
+  p.tolerance_m = source.number("tolerance_m", p.tolerance_m, 1e-9, 0.1, "m");
+  p.stall_timeout_s = source.number("stall_timeout", p.stall_timeout_s, 0.2, 600.0, "s");
+  p.retry_period_s = source.number("retry_period", p.retry_period_s, 0.05, 60.0, "s");
+  p.frame_id = source.frame("frame_id", p.frame_id);
+  p.child_frame_id = source.frame("child_frame_id", p.child_frame_id);
+  p.joint_name = source.frame("joint_name", p.joint_name);
+  source.ignore("diagnostic_period");
+  source.warnUnknown();
+  return p;
+}
+
+StageDriver::StageDriver(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
+                         StageParameters parameters, OpenStage open)
+    : node_(node),
+      parameters_(std::move(parameters)),
+      open_(std::move(open)),
+      joint_publisher_(node_.advertise<sensor_msgs::JointState>("joint_states", 50)),
+      state_publisher_(node_.advertise<StageState>("stage_state", 50)),
+      diagnostics_(node, private_node, private_node.getNamespace()),
+      server_(
+          node_, "move_stage", [this](Server::GoalHandle handle) { onGoal(std::move(handle)); },
+          [this](Server::GoalHandle handle) { onCancel(std::move(handle)); }, false) {
+  home_ = node_.advertiseService("home", &StageDriver::onHome, this);
+  halt_ = node_.advertiseService("halt", &StageDriver::onHalt, this);
+  recover_ = node_.advertiseService("recover", &StageDriver::onRecover, this);
+  diagnostics_.setHardwareID("none");
+  diagnostics_.add("stage", this, &StageDriver::diagnose);
+  thread_ = std::thread(&StageDriver::run, this);
+  server_.start();
+}
+
+StageDriver::~StageDriver() {
+  stop_ = true;
+  thread_.join();
+  const std::lock_guard<std::mutex> lock(mutex_);
+  try {
+    if (stage_ && stage_->read().moving) stage_->stop();
+  } catch (const std::exception& e) {
+    ROS_WARN_STREAM("stopping the stage: " << printable(e.what()));
+  }
+  finishLocked(Outcome::kAborted, "the stage node shuts down");
+}
+
+void StageDriver::run() {
+  const auto period = std::chrono::duration_cast<Steady::duration>(
+      std::chrono::duration<double>(1.0 / parameters_.rate_hz));
+  Steady::time_point next = Steady::now();
+  while (!stop_) {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      try {
+        pollLocked();
+      } catch (const std::exception& e) {
+        lostLocked(e.what());
+      }
+    }
+    next = std::max(next + period, Steady::now());
+    std::this_thread::sleep_until(next);
+  }
+}
+
+bool StageDriver::openLocked() {
+  if (stage_) return true;
+  if (Steady::now() < next_attempt_) return false;
+  next_attempt_ = Steady::now() + std::chrono::duration_cast<Steady::duration>(
+                                      std::chrono::duration<double>(parameters_.retry_period_s));
+  stage_ = open_();
+  const device::StageIdentity identity = stage_->identity();
+  diagnostics_.setHardwareID(identity.serial);
+  ROS_INFO_STREAM("opened " << printable(identity.vendor + " " + identity.model + " (" +
+                                         identity.serial + ")"));
+  told_problem_.clear();
+  return true;
+}
+
+void StageDriver::lostLocked(const std::string& problem) {
+  const bool was_open = stage_ != nullptr;
+  stage_.reset();
+  homing_ = false;
+  if (was_open) {
+    reading_.stamp = device::now();
+    reading_.velocity_mps = 0.0;
+    reading_.moving = false;
+    reading_.homed = false;
+    reading_.fault = "link lost";
+    publishLocked(reading_);
+  }
+  finishLocked(Outcome::kAborted, "the stage was lost: " + problem);
+  if (problem == told_problem_) return;
+  told_problem_ = problem;
+  ROS_WARN_STREAM("no stage, trying again every " << parameters_.retry_period_s
+                                                  << " s: " << printable(problem, 1000));
+}
+
+void StageDriver::pollLocked() {
+  if (!openLocked()) return;
+  reading_ = stage_->read();
+  publishLocked(reading_);
+  superviseLocked(reading_);
+}
+
+void StageDriver::publishLocked(const device::StageReading& reading) {
+  const ros::Time stamp = toRosTime(reading.stamp);
+  const Pose pose(Eigen::Translation3d(parameters_.axis * reading.position_m));
+  transforms_.sendTransform(
+      toTransformStamped(pose, stamp, parameters_.frame_id, parameters_.child_frame_id));
+
+  sensor_msgs::JointState joint;
+  joint.header.stamp = stamp;
+  joint.name = {parameters_.joint_name};
+  joint.position = {reading.position_m};
+  joint.velocity = {reading.velocity_mps};
+  joint_publisher_.publish(joint);
+
+  StageState state;
+  state.header.stamp = stamp;
+  state.header.frame_id = parameters_.frame_id;
+  state.position = reading.position_m;
+  state.velocity = reading.velocity_mps;
+  state.homed = reading.homed;
+  state.moving = reading.moving;
+  state.fault = reading.fault;
+  state_publisher_.publish(state);
+}
+
+bool StageDriver::motionOverLocked(const device::StageReading& reading) const {
+  return !reading.moving && (seen_moving_ || Steady::now() - began_ > kTimeToBegin);
+}
+
+void StageDriver::beganLocked() {
+  seen_moving_ = false;
+  began_ = Steady::now();
+  progress_at_ = began_;
+  progress_position_m_ = reading_.position_m;
+}
+
+void StageDriver::superviseLocked(const device::StageReading& reading) {
+  if (reading.fault != told_fault_) {
+    told_fault_ = reading.fault;
+    if (!reading.fault.empty()) ROS_WARN_STREAM("stage fault: " << printable(reading.fault));
+  }
+  if (reading.moving) seen_moving_ = true;
+  if (std::abs(reading.position_m - progress_position_m_) > kProgress) {
+    progress_position_m_ = reading.position_m;
+    progress_at_ = Steady::now();
+  }
+  if (!reading.fault.empty()) {
+    if (reading.moving) stage_->stop();
+    homing_ = false;
+    finishLocked(Outcome::kAborted, "the stage has the fault \"" + reading.fault + "\"");
+    return;
+  }
+  const bool ours = goal_ || homing_;
+  const bool stalled = ours && reading.moving &&
+                       std::chrono::duration<double>(Steady::now() - progress_at_).count() >
+                           parameters_.stall_timeout_s;
+  if (stalled) {
+    ROS_WARN_STREAM("the stage makes no progress, stopping it");
+    stage_->stop();
+    homing_ = false;
+    progress_at_ = Steady::now();
+    if (goal_) goal_->ending = Ending::kStall;
+  }
+  if (homing_ && motionOverLocked(reading)) {
+    homing_ = false;
+    if (reading.homed) {
+      ROS_INFO("the stage is homed");
+    } else {
+      ROS_WARN("homing ended without a reference");
+    }
+  }
+  if (!goal_) return;
+  MoveStageFeedback feedback;
+  feedback.position = reading.position_m;
+  goal_->handle.publishFeedback(feedback);
+  const double error = reading.position_m - goal_->target_m;
+  const bool there = std::abs(error) <= parameters_.tolerance_m;
+  if (reading.moving || !(motionOverLocked(reading) || there)) return;
+  switch (goal_->ending) {
+    case Ending::kCancel:
+      finishLocked(Outcome::kCanceled, "canceled");
+      break;
+    case Ending::kHalt:
+      finishLocked(Outcome::kAborted, "halted");
+      break;
+    case Ending::kStall:
+      finishLocked(Outcome::kAborted, "the stage made no progress for " +
+                                          formatNumber(parameters_.stall_timeout_s) + " s");
+      break;
+    case Ending::kArrive:
+      if (there) {
+        finishLocked(Outcome::kSucceeded, "");
+      } else {
+        finishLocked(Outcome::kAborted, "the stage stopped " + formatNumber(std::abs(error)) +
+                                            " m away from the goal");
+      }
+      break;
+  }
+}
+
+MoveStageResult StageDriver::resultOf(bool success, double position_m, const std::string& message) {
+  MoveStageResult result;
+  result.success = success;
+  result.position = position_m;
+  result.message = message;
+  return result;
+}
+
+void StageDriver::finishLocked(Outcome outcome, const std::string& message) {
+  if (!goal_) return;
+  Goal goal = std::move(*goal_);
+  goal_.reset();
+  const MoveStageResult result =
+      resultOf(outcome == Outcome::kSucceeded, reading_.position_m, message);
+  switch (outcome) {
+    case Outcome::kSucceeded:
+      goal.handle.setSucceeded(result, message);
+      break;
+    case Outcome::kAborted:
+      goal.handle.setAborted(result, message);
+      break;
+    case Outcome::kCanceled:
+      goal.handle.setCanceled(result, message);
+      break;
+  }
+}
+
+device::Stage& StageDriver::stageLocked() {
+  if (!stage_) throw device::StageError("there is no stage");
+  return *stage_;
+}
+
+double StageDriver::targetOfLocked(const MoveStageGoal& goal) {
+  if (!std::isfinite(goal.position)) throw InputError("move_stage", "position", "is not finite");
+  if (!std::isfinite(goal.speed) || goal.speed < 0.0) {
+    throw InputError("move_stage", "speed",
+                     "is " + formatNumber(goal.speed) + ", expected 0 (default) or above");
+  }
+  reading_ = stageLocked().read();
+  if (!reading_.fault.empty()) {
+    throw device::StageError("the stage has the fault \"" + reading_.fault +
+                             "\": recover it first");
+  }
+  if (homing_) throw device::StageError("the stage is homing");
+  const double target = goal.relative ? reading_.position_m + goal.position : goal.position;
+  if (reading_.homed) {
+    // Decimals written in a goal must not fail by a rounding error.
+    constexpr double kSlack = 1e-9;
+    if (target < parameters_.min_m - kSlack || target > parameters_.max_m + kSlack) {
+      throw InputError("move_stage", "position",
+                       "would be " + formatNumber(target) + " m, expected " +
+                           formatNumber(parameters_.min_m) + " to " +
+                           formatNumber(parameters_.max_m) + " m");
+    }
+  } else if (!goal.relative) {
+    throw device::StageError("the stage is not homed: only relative moves until home was called");
+  } else if (std::abs(goal.position) > parameters_.max_m - parameters_.min_m) {
+    throw InputError("move_stage", "position",
+                     "moves by more than the travel of " +
+                         formatNumber(parameters_.max_m - parameters_.min_m) + " m");
+  }
+  return target;
+}
+
+void StageDriver::onGoal(Server::GoalHandle handle) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  try {
+    const MoveStageGoal goal = *handle.getGoal();
+    const double target = targetOfLocked(goal);
+    stageLocked().moveTo(target, goal.speed > 0.0 ? goal.speed : parameters_.speed_mps);
+    finishLocked(Outcome::kCanceled, "replaced by a new goal");
+    handle.setAccepted();
+    goal_.emplace();
+    goal_->handle = std::move(handle);
+    goal_->target_m = target;
+    beganLocked();
+  } catch (const std::exception& e) {
+    ROS_WARN_STREAM("move_stage refused: " << printable(e.what(), 1000));
+    handle.setRejected(resultOf(false, reading_.position_m, e.what()), e.what());
+  }
+}
+
+void StageDriver::onCancel(Server::GoalHandle handle) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  if (!goal_ || !(goal_->handle == handle)) return;
+  goal_->ending = Ending::kCancel;
+  try {
+    stageLocked().stop();
+  } catch (const std::exception& e) {
+    lostLocked(e.what());
+  }
+}
+
+bool StageDriver::onHome(std_srvs::Trigger::Request& /*request*/,
+                         std_srvs::Trigger::Response& response) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  try {
+    stageLocked().home();
+    finishLocked(Outcome::kAborted, "homing was asked for");
+    homing_ = true;
+    beganLocked();
+    response.success = true;
+    response.message = "homing; stage_state tells when it is done";
+  } catch (const std::exception& e) {
+    response.success = false;
+    response.message = e.what();
+  }
+  return true;
+}
+
+bool StageDriver::onHalt(std_srvs::Trigger::Request& /*request*/,
+                         std_srvs::Trigger::Response& response) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  try {
+    stageLocked().stop();
+    homing_ = false;
+    if (goal_) goal_->ending = Ending::kHalt;
+    response.success = true;
+    response.message = "halted";
+  } catch (const std::exception& e) {
+    response.success = false;
+    response.message = e.what();
+  }
+  return true;
+}
+
+bool StageDriver::onRecover(std_srvs::Trigger::Request& /*request*/,
+                            std_srvs::Trigger::Response& response) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  try {
+    stageLocked().recover();
+    reading_ = stage_->read();
+    response.success = reading_.fault.empty();
+    response.message = reading_.fault.empty()
+                           ? (reading_.homed ? "ready" : "no fault; the stage is not homed")
+                           : "the fault \"" + reading_.fault + "\" stays";
+  } catch (const std::exception& e) {
+    response.success = false;
+    response.message = e.what();
+  }
+  return true;
+}
+
+void StageDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
+  using diagnostic_msgs::DiagnosticStatus;
+  const std::lock_guard<std::mutex> lock(mutex_);
+  if (!stage_) {
+    status.summary(DiagnosticStatus::ERROR, "no stage");
+  } else if (!reading_.fault.empty()) {
+    status.summary(DiagnosticStatus::ERROR, reading_.fault);
+  } else if (!reading_.homed) {
+    status.summary(DiagnosticStatus::WARN, "not homed");
+  } else {
+    status.summary(DiagnosticStatus::OK, reading_.moving ? "moving" : "resting");
+  }
+  status.add("position [m]", reading_.position_m);
+  status.add("velocity [m/s]", reading_.velocity_mps);
+  status.add("homed", reading_.homed ? "yes" : "no");
+  status.add("last problem", printable(told_problem_));
+}
+
+}  // namespace omnister
