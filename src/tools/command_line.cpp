@@ -19,10 +19,14 @@ namespace omnister::tools {
 
 // One line a subcommand, in the order of --help.
 // (declarations here, table below: kept together so that adding a command touches one place)
+void addProject(CLI::App& app);
+void addUnproject(CLI::App& app);
 
 namespace {
 
 constexpr AddCommand kCommands[] = {
+    addProject,
+    addUnproject,
     nullptr,
 };
 

@@ -39,7 +39,7 @@ struct LensFile {
   CalibrationRecord calibration;
 };
 
-/// The nearest standard ROS model (equidistant, or plumb_bob for narrow fields) of a lens over its
+/// The nearest standard ROS model ("equidistant", Kannala and Brandt 2006) of a lens over its
 /// image.
 struct StandardCameraInfo {
   std::string distortion_model;
