@@ -259,15 +259,16 @@ std::unique_ptr<AtomicFile> stageRange(const fs::path& path, const cv::Mat& rang
   if (range.type() != CV_32FC1 || range.empty()) {
     throw Error("a range image is not one channel of 32-bit floats");
   }
+  // Encoded in memory: libtiff complains on standard error when it cannot open a file itself.
+  std::vector<uchar> bytes;
+  if (!cv::imencode(".tiff", range, bytes)) throw IoError("encode", path.string(), EIO);
   auto file = std::make_unique<AtomicFile>(path);
   errno = 0;
-  bool written = false;
-  try {
-    written = cv::imwrite(file->path().string(), range);
-  } catch (const cv::Exception&) {
-    written = false;
-  }
-  if (!written) throw IoError("write", path.string(), errno != 0 ? errno : EIO);
+  std::ofstream stream(file->path(), std::ios::binary);
+  stream.write(reinterpret_cast<const char*>(bytes.data()),
+               static_cast<std::streamsize>(bytes.size()));
+  stream.close();
+  if (!stream) throw IoError("write", path.string(), errno != 0 ? errno : EIO);
   return file;
 }
 

@@ -21,12 +21,16 @@ namespace omnister::tools {
 // (declarations here, table below: kept together so that adding a command touches one place)
 void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
+void addStereo(CLI::App& app);
+void addEvaluate(CLI::App& app);
 
 namespace {
 
 constexpr AddCommand kCommands[] = {
     addProject,
     addUnproject,
+    addStereo,
+    addEvaluate,
     nullptr,
 };
 

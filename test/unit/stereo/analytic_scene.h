@@ -135,7 +135,7 @@ inline std::vector<Rectangle> room(double distance, double shortest_wave, unsign
 inline Pose pose(double x, double y, double z, double angle = 0.0,
                  const Eigen::Vector3d& axis = Eigen::Vector3d::UnitY()) {
   Pose result = Pose::Identity();
-  result.translation() = {x, y, z};
+  result.translation() = Eigen::Vector3d(x, y, z);
   result.linear() = Eigen::AngleAxisd(angle, axis.normalized()).toRotationMatrix();
   return result;
 }
