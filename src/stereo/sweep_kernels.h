@@ -33,22 +33,25 @@ struct PaddedImage {
   }
 };
 
-inline constexpr int kLanes =
-    32;                           ///< hypotheses of a chunk; the outer two only serve as neighbours
-inline constexpr int kBits = 24;  ///< of a descriptor: 5x5 less the centre
+inline constexpr int kBits = 24;   ///< of a descriptor: 5x5 less the centre
 inline constexpr int kPlanes = 3;  ///< its bytes, each in an array of its own
 
-/// One tile's descriptors, the cells they are compared with, and the window.
+/// One tile's descriptors, the cells they are compared with, and the window. Arrays by pixel have
+/// `stride` elements a row.
 struct ChunkJob {
   int width = 0, height = 0;  ///< of the tile with its halo of `radius`
+  int stride = 0;
   int radius = 3;
-  const std::int32_t* base = nullptr;  ///< cell of lane 0, by pixel
+  int lanes = 32;  ///< hypotheses tried: 16 or 32; the outer two only serve as neighbours
+  const std::int32_t* base = nullptr;  ///< cell of hypothesis 0, by pixel
+  int first = 0;                       ///< hypothesis of lane 0
+  std::int32_t cells_end = 0;          ///< cells at or behind it are not asked for
   const std::uint8_t* reference[kPlanes] = {};
   const std::uint8_t* cells[kPlanes] = {};
-  int first = 0;  ///< lane 0 is hypothesis `first` of the tile
-  /// State by pixel of the tile without halo; a chunk replaces it where it finds a lower cost.
+  /// State by pixel of the tile without halo, `width - 2 radius` a row; a chunk replaces it where
+  /// it finds a lower cost.
   std::uint16_t* cost = nullptr;  ///< 0xFFFF at first
-  std::uint16_t* index = nullptr;
+  std::int16_t* index = nullptr;
   std::uint16_t* before = nullptr;  ///< costs of the neighbouring hypotheses
   std::uint16_t* after = nullptr;
   std::vector<std::uint8_t>* scratch = nullptr;
@@ -73,10 +76,86 @@ void censusRow(const std::uint8_t* const rows[5], int count, std::uint8_t* const
 struct CensusOffsets {
   float dx[kBits], dy[kBits];
 };
-/// Census of the pixels [x0, x0 + width) x [y0, y0 + height) in the local epipolar frame.
-/// @param out each with `stride` bytes a row
-void censusBlock(const PaddedImage& image, int x0, int y0, int width, int height,
-                 const CensusOffsets& offsets, std::uint8_t* const out[kPlanes], int stride);
+/// Grey values times 128 of the rectangle at (x0, y0), which may reach into the padding.
+void widenBlock(const PaddedImage& image, int x0, int y0, int width, int height, std::int16_t* out,
+                int stride);
+
+/// Census in the local epipolar frame. Columns are done 32 (or 16 for `narrow`) at a time: that
+/// much room is needed in `out`. @param grey of widenBlock(), at the block's first pixel
+void censusBlock(const std::int16_t* grey, int grey_stride, int width, int height,
+                 const CensusOffsets& offsets, bool narrow, std::uint8_t* const out[kPlanes],
+                 int stride);
+
+/// From epipolar coordinates to cells.
+struct MapJob {
+  float row_scale = 0, row_offset = 0;
+  int rows = 0;
+  const std::int32_t* origin = nullptr;  ///< by row
+  float to_column = 0;
+};
+/// @param base [out] cell, -1 where there is no ray
+/// @param residual [out] whole column less exact column; 0 where there is no ray
+void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int count,
+            std::int32_t* base, float* residual);
+
+/// Mean of a square window, for `count` pixels of a row whose windows begin at `in`.
+/// @param line room for count + 2 radius
+void boxMeanRow(const float* in, int stride, int radius, int count, float* line, float* out);
+
+/// From costs to hypotheses, one row of a tile.
+struct ConcludeJob {
+  int count = 0;
+  const std::uint16_t* cost = nullptr;
+  const std::int16_t* index = nullptr;
+  const std::uint16_t* before = nullptr;
+  const std::uint16_t* after = nullptr;
+  const std::int32_t* base = nullptr;  ///< of the row's first pixel
+  const float* residual = nullptr;     ///< mean over the window, by pixel
+  const std::uint16_t* phi = nullptr;
+  const float* a = nullptr;
+  const std::uint8_t* mask = nullptr;  ///< of the grid
+  std::int32_t cells = 0;
+  float step_h = 0;
+  float worst_cost = 0;
+  float* h = nullptr;              ///< [out] NaN where nothing was found
+  std::uint16_t* steep = nullptr;  ///< [out] rise of cost to the higher neighbour; may be null
+  // Where the match falls on the claims image; skipped when claim is null.
+  float claim_x = 0, claim_y = 0, claim_y_offset = 0;
+  int claim_width = 0, claim_height = 0;
+  std::int32_t* claim = nullptr;  ///< [out] -1 where nothing was found
+};
+void concludeRow(const ConcludeJob& job);
+
+/// Makes NaN of hypotheses whose claim went to another by more than `tolerance` (in units of
+/// claims).
+/// @return how many
+std::size_t checkRow(const std::uint32_t* claims, const std::int32_t* claim, float to_units,
+                     float tolerance, float* h, int count);
+
+/// A hypothesis as the low half of a claim.
+inline constexpr float kClaimOffset = 64.0f;
+
+/// Median of 3x3 where the middle is valid, neighbours that are not counting as the middle.
+/// @param rows above, here, below; one element before and behind must be readable
+void medianRow(const float* const rows[3], int count, float* out);
+
+struct TriangulateJob {
+  int count = 0;
+  bool inverse = false;  ///< h is 1 / rho, else the parallax angle
+  float baseline = 0;    ///< [m]
+  const float* a = nullptr;
+  const float* h = nullptr;
+  const std::uint16_t* cost = nullptr;
+  const std::uint16_t* steep = nullptr;
+  float step_h = 0;
+  float min_range = 0, max_range = 0;
+  float full_cost = 0;  ///< of a match that is worth nothing
+  float* range = nullptr;
+  float* sigma = nullptr;
+  float* score = nullptr;
+  std::size_t no_parallax = 0, out_of_range = 0, valid = 0;  ///< counted up
+};
+void triangulateRow(TriangulateJob* job);
 
 void matchChunk(const ChunkJob& job);
 

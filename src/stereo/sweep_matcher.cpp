@@ -7,6 +7,7 @@
 #include <chrono>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
@@ -25,6 +26,7 @@ constexpr int kRadius = 3;  ///< of the box that costs are summed over
 constexpr int kWindow = 2 * kRadius + 1;
 constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 constexpr float kFullCost = kWindow * kWindow * kBits;  ///< every bit of every descriptor wrong
+constexpr int kSpeckle = 100;                           ///< regions of fewer pixels go
 constexpr float kWorstShare = 0.36f;  ///< of it, that a match may cost; chance gives a half
 
 class Stopwatch {
@@ -53,13 +55,21 @@ struct Level {
 
 /// What a thread keeps between tiles.
 struct Scratch {
-  std::vector<std::int32_t> base, shifted;
-  std::vector<float> column, residual, residual_row;
-  std::vector<std::uint16_t> row;
+  std::vector<std::int32_t> base;
+  std::vector<float> residual, residual_line, residual_mean, a;
+  std::vector<std::uint16_t> phi;
+  std::vector<std::int16_t> wide;
   std::vector<std::uint8_t> reference[kPlanes], costs, grey;
-  std::vector<std::uint16_t> cost, index, before, after;
+  std::vector<std::uint16_t> cost, before, after;
+  std::vector<std::int16_t> index;
   std::vector<int> histogram;
 };
+
+/// A plane of one value a pixel; vector code may write up to 64 elements behind the end of a row.
+cv::Mat makePlane(cv::Size size, int type) {
+  const cv::Mat room(size.height, (size.width + 63) / 64 * 64 + 64, type);
+  return room.colRange(0, size.width);
+}
 
 class SweepMatcher : public Matcher {
  public:
@@ -96,8 +106,12 @@ class SweepMatcher : public Matcher {
       const cv::Size r = reduced(geometry.reference_size), d = reduced(displaced.size);
       level.reference.create(r.width, r.height);
       level.displaced.create(d.width, d.height);
-      level.h.create(r, CV_32FC1);
+      level.h = makePlane(r, CV_32FC1);
+      // Vector code reads whole vectors.
+      level.map.phi.resize(level.map.phi.size() + 64, kNoRay);
+      level.map.a.resize(level.map.a.size() + 64, 0.0f);
     }
+    prepareClaims();
   }
 
   MatchResult match(const cv::Mat& reference, const std::vector<cv::Mat>& displaced) override {
@@ -114,14 +128,40 @@ class SweepMatcher : public Matcher {
       matchLevel(l);
       watch.lap(l == 0 ? "match" : "coarse");
     }
-    finish(&result);
-    watch.lap("finish");
+    finish(&result, &watch);
     result.statistics.seconds["total"] =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     return result;
   }
 
  private:
+  void prepareClaims() {
+    const Level& level = levels_.front();
+    const cv::Size size = level.map.size;
+    cost_ = makePlane(size, CV_16UC1);
+    steep_ = makePlane(size, CV_16UC1);
+    claim_ = makePlane(size, CV_32SC1);
+    smooth_ = makePlane(size, CV_32FC1);
+    claim_rows_.assign(level.layout.tiles.size(), {1, 0});
+    finest_step_ = std::numeric_limits<float>::max();
+    for (const Band& band : level.grid.bands)
+      finest_step_ = std::min(finest_step_, static_cast<float>(band.step_h));
+    field_ = level.map.phi.size() - std::count(level.map.phi.begin(), level.map.phi.end(), kNoRay);
+    // phi sin(theta) over the field, a tile at a time.
+    float least = 0, most = 0;
+    for (std::size_t i = 0; i < static_cast<std::size_t>(size.area()); i += 7) {
+      if (level.map.phi[i] == kNoRay) continue;
+      const float phi = static_cast<float>(level.map.phi[i] / kPhiUnits - 3.14159265);
+      least = std::min(least, phi);
+      most = std::max(most, phi);
+    }
+    claim_x_ = 1 / finest_step_;
+    claim_y_offset_ = std::floor(least * claim_x_) - 4;
+    claim_size_ = cv::Size(static_cast<int>(3.1416f * claim_x_) + 2,
+                           static_cast<int>(most * claim_x_ - claim_y_offset_) + 8);
+    claims_.resize(static_cast<std::size_t>(claim_size_.area()));
+  }
+
   void makePyramid(const cv::Mat& image, PaddedImage Level::*member) {
     constexpr int kStrip = 32;
     for (std::size_t l = 0; l < levels_.size(); ++l) {
@@ -227,59 +267,60 @@ class SweepMatcher : public Matcher {
 
   void matchLevel(std::size_t l) {
     Level& level = levels_[l];
-    if (l == 0) {
-      cost_.create(level.map.size, CV_16UC1);
-      sharpness_.create(level.map.size, CV_16UC1);
-      target_.create(level.map.size, CV_32SC1);
-    }
     parallelFor(0, level.layout.tiles.size(), options_.threads,
-                [&](std::size_t t) { matchTile(l, level.layout.tiles[t], &scratch_.local()); });
+                [&](std::size_t t) { matchTile(l, t, &scratch_.local()); });
   }
 
-  void matchTile(std::size_t l, const Tile& tile, Scratch* scratch) {
+  void matchTile(std::size_t l, std::size_t t, Scratch* scratch) {
     Level& level = levels_[l];
+    const Tile& tile = level.layout.tiles[t];
     const ReferenceMap& map = level.map;
     const cv::Rect& rect = tile.rect;
     if (tile.band < 0) {
       level.h(rect).setTo(kNaN);
       if (l == 0) {
-        cost_(rect).setTo(0xFFFF);
-        target_(rect).setTo(-1);
+        claim_(rect).setTo(-1);
+        claim_rows_[t] = {1, 0};
       }
       return;
     }
     const Band& band = level.grid.bands[tile.band];
     const int width = rect.width + 2 * kRadius, height = rect.height + 2 * kRadius;
-    const int pixels = width * height;
-    scratch->base.resize(pixels);
-    scratch->shifted.resize(pixels);
-    scratch->row.resize(pixels);
-    scratch->residual.resize(pixels);
-    const double to_column = level.grid.column_scale / band.step_h;
+    const int stride = (width + 31) / 32 * 32;
+    const std::size_t room = static_cast<std::size_t>(stride) * height + 64;
+    scratch->base.resize(room);
+    scratch->residual.resize(room);
+    MapJob map_job;
+    map_job.row_scale = static_cast<float>(band.row_scale);
+    map_job.row_offset = static_cast<float>(band.row_offset);
+    map_job.rows = band.rows;
+    map_job.origin = band.origin.data();
+    map_job.to_column = static_cast<float>(level.grid.column_scale / band.step_h);
+    const int x0 = rect.x - kRadius;
+    const bool whole = x0 >= 0 && x0 + width <= map.size.width;
+    scratch->phi.resize(stride + 64);
+    scratch->a.resize(stride + 64);
     for (int y = 0; y < height; ++y) {
       const int v = std::clamp(rect.y + y - kRadius, 0, map.size.height - 1);
-      for (int x = 0; x < width; ++x) {
-        const int u = std::clamp(rect.x + x - kRadius, 0, map.size.width - 1);
-        const std::size_t i = static_cast<std::size_t>(v) * map.size.width + u;
-        const int at = y * width + x;
-        if (map.phi[i] == kNoRay) {
-          scratch->base[at] = -1;
-          scratch->residual[at] = 0;
-          continue;
+      const std::uint16_t* phi = &map.phi[static_cast<std::size_t>(v) * map.size.width];
+      const float* a = &map.a[static_cast<std::size_t>(v) * map.size.width];
+      if (whole) {
+        phi += x0;
+        a += x0;
+      } else {
+        for (int x = 0; x < width; ++x) {
+          const int u = std::clamp(x0 + x, 0, map.size.width - 1);
+          scratch->phi[x] = phi[u];
+          scratch->a[x] = a[u];
         }
-        const int row =
-            std::clamp(static_cast<int>(map.phi[i] * band.row_scale + band.row_offset + 0.5), 0,
-                       band.rows - 1);
-        const float column = static_cast<float>(map.a[i] * to_column);
-        const float whole = std::floor(column + 0.5f);
-        scratch->row[at] = static_cast<std::uint16_t>(row);
-        scratch->residual[at] = whole - column;
-        scratch->base[at] = band.origin[row] + static_cast<std::int32_t>(whole);
+        phi = scratch->phi.data();
+        a = scratch->a.data();
       }
+      mapRow(map_job, phi, a, width, &scratch->base[y * stride], &scratch->residual[y * stride]);
     }
-    describeTile(level, tile, band, scratch);
+    describeTile(l, tile, band, stride, scratch);
 
-    const std::size_t inner = rect.area();
+    const std::size_t inner = rect.area() + 64;
     scratch->cost.assign(inner, 0xFFFF);
     scratch->index.assign(inner, 0);
     scratch->before.assign(inner, 0);
@@ -287,8 +328,10 @@ class SweepMatcher : public Matcher {
     ChunkJob job;
     job.width = width;
     job.height = height;
+    job.stride = stride;
     job.radius = kRadius;
-    job.base = scratch->shifted.data();
+    job.base = scratch->base.data();
+    job.cells_end = level.grid.cells;
     for (int p = 0; p < kPlanes; ++p) {
       job.reference[p] = scratch->reference[p].data();
       job.cells[p] = level.cells[p].data();
@@ -298,31 +341,34 @@ class SweepMatcher : public Matcher {
     job.before = scratch->before.data();
     job.after = scratch->after.data();
     job.scratch = &scratch->costs;
-    const auto found = intervals(l, tile, band, scratch);
-    const int origin = found.front().first - 1;
-    for (const auto& [from, to] : found) {
-      for (int first = from - 1; first < to; first += kLanes - 2) {
-        for (int i = 0; i < pixels; ++i) {
-          // Stray reads of the halo are harmless inside the array.
-          scratch->shifted[i] =
-              scratch->base[i] < 0 ? 0 : std::clamp(scratch->base[i] + first, 0, level.grid.cells);
-        }
-        job.first = first - origin;
+    for (const auto& [from, to] : intervals(l, tile, band, scratch)) {
+      for (job.first = from - 1; job.first < to; job.first += job.lanes - 2) {
+        job.lanes = to - job.first < 15 ? 16 : 32;
         matchChunk(job);
       }
     }
-    concludeTile(l, tile, band, origin, scratch);
+    concludeTile(l, t, stride, scratch);
   }
 
   /// Census of the tile's pixels and halo in the local epipolar frames.
-  void describeTile(const Level& level, const Tile& tile, const Band& band,
+  void describeTile(std::size_t l, const Tile& tile, const Band& band, int stride,
                     Scratch* scratch) const {
+    const Level& level = levels_[l];
     const cv::Rect& rect = tile.rect;
     const int width = rect.width + 2 * kRadius, height = rect.height + 2 * kRadius;
-    for (auto& plane : scratch->reference) plane.assign(width * height, 0);
+    for (auto& plane : scratch->reference)
+      plane.assign(static_cast<std::size_t>(stride) * height + 64, 0);
+    // Everything that windows of this tile can touch.
+    constexpr int kAround = PaddedImage::kPad - kRadius;
+    const int wide_stride = stride + 2 * kAround;
+    scratch->wide.resize(static_cast<std::size_t>(wide_stride) * (height + 2 * kAround) + 64);
+    widenBlock(level.reference, rect.x - kRadius - kAround, rect.y - kRadius - kAround,
+               width + 2 * kAround, height + 2 * kAround, scratch->wide.data(), wide_stride);
+    const bool narrow = l > 0;
+    const int block = narrow ? kBlock : 2 * kBlock;
     for (int y = 0; y < height; y += kBlock) {
-      for (int x = 0; x < width; x += kBlock) {
-        const int w = std::min(kBlock, width - x), h = std::min(kBlock, height - y);
+      for (int x = 0; x < width; x += block) {
+        const int w = std::min(block, width - x), h = std::min(kBlock, height - y);
         const int u0 = rect.x + x - kRadius, v0 = rect.y + y - kRadius;
         Eigen::Vector2f d_phi, d_a;
         bool found = false;
@@ -351,150 +397,173 @@ class SweepMatcher : public Matcher {
           offsets.dy[i] = offset.y();
         }
         std::uint8_t* out[kPlanes];
-        for (int p = 0; p < kPlanes; ++p) out[p] = &scratch->reference[p][y * width + x];
-        censusBlock(level.reference, u0, v0, w, h, offsets, out, width);
+        for (int p = 0; p < kPlanes; ++p) out[p] = &scratch->reference[p][y * stride + x];
+        censusBlock(&scratch->wide[(y + kAround) * wide_stride + x + kAround], wide_stride, w, h,
+                    offsets, narrow, out, stride);
       }
     }
   }
 
-  void concludeTile(std::size_t l, const Tile& tile, const Band& band, int origin,
-                    Scratch* scratch) {
+  void concludeTile(std::size_t l, std::size_t t, int stride, Scratch* scratch) {
     Level& level = levels_[l];
+    const Tile& tile = level.layout.tiles[t];
+    const Band& band = level.grid.bands[tile.band];
     const cv::Rect& rect = tile.rect;
-    const int width = rect.width + 2 * kRadius;
-    // Mean of the residual over the window: what rounding to whole columns did to it.
-    std::vector<float>& mean = scratch->residual_row;
-    mean.resize(width);
+    scratch->residual_line.resize(stride + 64);
+    scratch->residual_mean.resize(stride + 64);
+    ConcludeJob job;
+    job.count = rect.width;
+    job.residual = scratch->residual_mean.data();
+    job.mask = level.grid.mask.data();
+    job.cells = level.grid.cells;
+    job.step_h = static_cast<float>(band.step_h);
+    job.worst_cost = kWorstShare * kFullCost;
+    job.claim_x = claim_x_;
+    job.claim_y = claim_x_;
+    job.claim_y_offset = claim_y_offset_;
+    job.claim_width = claim_size_.width;
+    job.claim_height = claim_size_.height;
     for (int y = 0; y < rect.height; ++y) {
-      for (int x = 0; x < width; ++x) {
-        float sum = 0;
-        for (int k = 0; k < kWindow; ++k) sum += scratch->residual[(y + k) * width + x];
-        mean[x] = sum * (1.0f / (kWindow * kWindow));
+      boxMeanRow(&scratch->residual[y * stride], stride, kRadius, rect.width,
+                 scratch->residual_line.data(), scratch->residual_mean.data());
+      const std::size_t i = static_cast<std::size_t>(y) * rect.width;
+      const std::size_t pixel =
+          static_cast<std::size_t>(rect.y + y) * level.map.size.width + rect.x;
+      job.cost = &scratch->cost[i];
+      job.index = &scratch->index[i];
+      job.before = &scratch->before[i];
+      job.after = &scratch->after[i];
+      job.base = &scratch->base[(y + kRadius) * stride + kRadius];
+      job.phi = &level.map.phi[pixel];
+      job.a = &level.map.a[pixel];
+      job.h = level.h.ptr<float>(rect.y + y) + rect.x;
+      if (l == 0) {
+        job.steep = steep_.ptr<std::uint16_t>(rect.y + y) + rect.x;
+        job.claim = claim_.ptr<std::int32_t>(rect.y + y) + rect.x;
+        std::copy(job.cost, job.cost + rect.width, cost_.ptr<std::uint16_t>(rect.y + y) + rect.x);
       }
-      float* h = level.h.ptr<float>(rect.y + y) + rect.x;
-      std::uint16_t* cost = l == 0 ? cost_.ptr<std::uint16_t>(rect.y + y) + rect.x : nullptr;
-      std::uint16_t* sharpness =
-          l == 0 ? sharpness_.ptr<std::uint16_t>(rect.y + y) + rect.x : nullptr;
-      std::int32_t* target = l == 0 ? target_.ptr<std::int32_t>(rect.y + y) + rect.x : nullptr;
+      concludeRow(job);
+    }
+    if (l > 0) return;
+    std::int32_t least = std::numeric_limits<std::int32_t>::max(), most = -1;
+    for (int y = 0; y < rect.height; ++y) {
+      const std::int32_t* claim = claim_.ptr<std::int32_t>(rect.y + y) + rect.x;
       for (int x = 0; x < rect.width; ++x) {
-        const std::size_t i = static_cast<std::size_t>(y) * rect.width + x;
-        const int at = (y + kRadius) * width + x + kRadius;
-        h[x] = kNaN;
-        if (l == 0) cost[x] = 0xFFFF, target[x] = -1, sharpness[x] = 0;
-        const float c = scratch->cost[i];
-        if (scratch->base[at] < 0 || c > kWorstShare * kFullCost) continue;
-        const float cm = scratch->before[i], cp = scratch->after[i];
-        const float steep = std::max(cm, cp) - c;
-        if (!(steep > 0)) continue;
-        float residual = 0;
-        for (int k = 0; k < kWindow; ++k) residual += mean[x + k];
-        const float shift = (cm - cp) / (2 * steep);
-        const int k = scratch->index[i] + origin;
-        const std::int32_t cell = scratch->base[at] + k;
-        if (cell < 0 || cell >= level.grid.cells || !(level.grid.mask[cell / 8] >> (cell % 8) & 1))
-          continue;
-        h[x] = (k + shift + residual) * static_cast<float>(band.step_h);
-        if (l > 0) continue;
-        cost[x] = static_cast<std::uint16_t>(c);
-        sharpness[x] = static_cast<std::uint16_t>(steep);
-        const int row = scratch->row[at];
-        const int column = cell - band.origin[row] - band.begin[row];
-        const float* nx = &level.grid.x[band.node[row] + column / 8];
-        const float* ny = &level.grid.y[band.node[row] + column / 8];
-        const float t = (column % 8) * 0.125f;
-        const int u = static_cast<int>(nx[0] + t * (nx[1] - nx[0]) + 0.5f);
-        const int v = static_cast<int>(ny[0] + t * (ny[1] - ny[0]) + 0.5f);
-        target[x] = std::clamp(v, 0, level.displaced.height - 1) * level.displaced.width +
-                    std::clamp(u, 0, level.displaced.width - 1);
+        most = std::max(most, claim[x]);
+        least = std::min(least, claim[x] < 0 ? std::numeric_limits<std::int32_t>::max() : claim[x]);
       }
     }
+    claim_rows_[t] = {least / claim_size_.width, most < 0 ? -1 : most / claim_size_.width};
   }
 
-  void finish(MatchResult* result) {
+  /// Two pixels that see one spot of the displaced image: the better match has it.
+  void claimAll() {
     Level& level = levels_.front();
-    const int width = level.map.size.width, height = level.map.size.height;
-    float step = std::numeric_limits<float>::max();
-    for (const Band& band : level.grid.bands)
-      step = std::min(step, static_cast<float>(band.step_h));
-    auto& rejected = result->statistics.rejected;
-    // Two pixels that fall on one pixel of the displaced image: the better match has it.
-    std::vector<std::uint32_t> claims(
-        static_cast<std::size_t>(level.displaced.width) * level.displaced.height, 0xFFFFFFFFu);
-    const float to_quarters = 4 / step;
-    for (int y = 0; y < height; ++y) {
-      for (int x = 0; x < width; ++x) {
-        const std::int32_t target = target_.at<std::int32_t>(y, x);
-        if (target < 0) continue;
-        const auto h = static_cast<std::uint32_t>(
-            std::clamp(level.h.at<float>(y, x) * to_quarters + 64.0f, 0.0f, 65535.0f));
-        claims[target] = std::min(
-            claims[target], static_cast<std::uint32_t>(cost_.at<std::uint16_t>(y, x)) << 16 | h);
-      }
-    }
-    std::size_t inconsistent = 0, field = 0, matched = 0;
-    for (int y = 0; y < height; ++y) {
-      for (int x = 0; x < width; ++x) {
-        field += level.map.phi[static_cast<std::size_t>(y) * width + x] != kNoRay;
-        const std::int32_t target = target_.at<std::int32_t>(y, x);
-        if (target < 0) continue;
-        ++matched;
-        float& value = level.h.at<float>(y, x);
-        const float h = std::clamp(value * to_quarters + 64.0f, 0.0f, 65535.0f);
-        if (std::fabs(h - static_cast<float>(claims[target] & 0xFFFF)) > 6.0f) {
-          value = kNaN;
-          ++inconsistent;
+    constexpr int kStrip = 64;
+    const int strips = (claim_size_.height + kStrip - 1) / kStrip;
+    const float to_units = 4 / finest_step_;
+    parallelFor(0, strips, options_.threads, [&](std::size_t s) {
+      const int begin = static_cast<int>(s) * kStrip;
+      const int end = std::min(begin + kStrip, claim_size_.height);
+      const std::int32_t first = begin * claim_size_.width, last = end * claim_size_.width;
+      std::fill(claims_.begin() + first, claims_.begin() + last, 0xFFFFFFFFu);
+      for (std::size_t t = 0; t < level.layout.tiles.size(); ++t) {
+        if (claim_rows_[t].second < begin || claim_rows_[t].first >= end) continue;
+        const cv::Rect& rect = level.layout.tiles[t].rect;
+        for (int y = rect.y; y < rect.br().y; ++y) {
+          const std::int32_t* claim = claim_.ptr<std::int32_t>(y);
+          const float* h = level.h.ptr<float>(y);
+          const std::uint16_t* cost = cost_.ptr<std::uint16_t>(y);
+          for (int x = rect.x; x < rect.br().x; ++x) {
+            if (claim[x] < first || claim[x] >= last) continue;
+            const int units =
+                std::clamp(static_cast<int>(h[x] * to_units + kClaimOffset + 0.5f), 0, 0xFFFF);
+            std::uint32_t& best = claims_[claim[x]];
+            best = std::min(best, static_cast<std::uint32_t>(cost[x]) << 16 |
+                                      static_cast<std::uint32_t>(units));
+          }
         }
       }
-    }
-    rejected["no match"] = field - matched;
-    rejected["left-right"] = inconsistent;
-    cv::Mat smooth;
-    medianFilter(level.h, &smooth, options_.threads);
-    rejected["speckle"] = removeSpeckles(&smooth, step, 100, options_.threads);
+    });
+  }
+
+  void finish(MatchResult* result, Stopwatch* watch) {
+    Level& level = levels_.front();
+    const int width = level.map.size.width, height = level.map.size.height;
+    constexpr int kStrip = 16;
+    const int strips = (height + kStrip - 1) / kStrip;
+    const auto forRows = [&](const auto& body) {
+      parallelFor(0, strips, options_.threads, [&](std::size_t s) {
+        const int begin = static_cast<int>(s) * kStrip;
+        body(s, begin, std::min(begin + kStrip, height));
+      });
+    };
+    auto& rejected = result->statistics.rejected;
+
+    claimAll();
+    watch->lap("claims");
+    std::vector<std::size_t> matched(strips), lost(strips);
+    forRows([&](std::size_t s, int begin, int end) {
+      for (int y = begin; y < end; ++y) {
+        const std::int32_t* claim = claim_.ptr<std::int32_t>(y);
+        float* h = level.h.ptr<float>(y);
+        matched[s] += width - std::count(claim, claim + width, -1);
+        std::fill(h + width, h + width + 64, kNaN);
+        lost[s] += checkRow(claims_.data(), claim, 4 / finest_step_, 6.0f, h, width);
+      }
+    });
+    watch->lap("check");
+    rejected["no match"] = field_ - std::accumulate(matched.begin(), matched.end(), std::size_t{0});
+    rejected["left-right"] = std::accumulate(lost.begin(), lost.end(), std::size_t{0});
+
+    const std::vector<float> nothing(width + 128, kNaN);
+    forRows([&](std::size_t, int begin, int end) {
+      for (int y = begin; y < end; ++y) {
+        const auto line = [&](int v) {
+          return v < 0 || v >= height ? nothing.data() + 16 : level.h.ptr<float>(v);
+        };
+        const float* rows[3] = {line(y - 1), line(y), line(y + 1)};
+        medianRow(rows, width, smooth_.ptr<float>(y));
+      }
+    });
+    watch->lap("median");
+    rejected["speckle"] = removeSpeckles(&smooth_, finest_step_, kSpeckle, options_.threads);
+    watch->lap("speckle");
 
     result->range.create(height, width, CV_32FC1);
     result->sigma.create(height, width, CV_32FC1);
     result->score.create(height, width, CV_32FC1);
-    std::size_t out_of_range = 0, no_parallax = 0, valid = 0;
-    const float b = static_cast<float>(frame_.baseline);
-    for (int y = 0; y < height; ++y) {
-      for (int x = 0; x < width; ++x) {
-        const std::size_t i = static_cast<std::size_t>(y) * width + x;
-        float& range = result->range.at<float>(y, x);
-        float& sigma = result->sigma.at<float>(y, x);
-        float& score = result->score.at<float>(y, x);
-        range = sigma = score = kNaN;
-        const float delta = smooth.at<float>(y, x);
-        if (std::isnan(delta)) continue;
-        const float theta = level.map.a[i];
-        const float sine = std::sin(theta), s = std::sin(delta);
-        if (!(s > 0)) {
-          ++no_parallax;
-          continue;
-        }
-        const float r = b * std::sin(theta + delta) / s;
-        const float c = cost_.at<std::uint16_t>(y, x), steep = sharpness_.at<std::uint16_t>(y, x);
-        const float sigma_h = step * (0.05f + 0.35f * std::sqrt(c + 20.0f) / std::max(steep, 1.0f));
-        const float sr = b * sine / (s * s) * sigma_h;
-        if (!(r > 0) || !(sr < 0.5f * r)) {
-          ++no_parallax;
-          continue;
-        }
-        if ((options_.min_range > 0 && r < options_.min_range) ||
-            (options_.max_range > 0 && r > options_.max_range)) {
-          ++out_of_range;
-          continue;
-        }
-        range = r;
-        sigma = sr;
-        score = std::clamp(1.0f - c / (kWorstShare * kFullCost), 0.0f, 1.0f) *
-                std::min(1.0f, steep / 60.0f);
-        ++valid;
+    std::vector<TriangulateJob> jobs(strips);
+    forRows([&](std::size_t s, int begin, int end) {
+      TriangulateJob& job = jobs[s];
+      job.count = width;
+      job.baseline = static_cast<float>(frame_.baseline);
+      job.step_h = finest_step_;
+      job.min_range = static_cast<float>(options_.min_range);
+      job.max_range = options_.max_range > 0 ? static_cast<float>(options_.max_range)
+                                             : std::numeric_limits<float>::max();
+      job.full_cost = kWorstShare * kFullCost;
+      for (int y = begin; y < end; ++y) {
+        job.a = &level.map.a[static_cast<std::size_t>(y) * width];
+        job.h = smooth_.ptr<float>(y);
+        job.cost = cost_.ptr<std::uint16_t>(y);
+        job.steep = steep_.ptr<std::uint16_t>(y);
+        job.range = result->range.ptr<float>(y);
+        job.sigma = result->sigma.ptr<float>(y);
+        job.score = result->score.ptr<float>(y);
+        triangulateRow(&job);
       }
+    });
+    std::size_t out_of_range = 0, no_parallax = 0, valid = 0;
+    for (const TriangulateJob& job : jobs) {
+      out_of_range += job.out_of_range;
+      no_parallax += job.no_parallax;
+      valid += job.valid;
     }
     rejected["range limits"] = out_of_range;
     rejected["parallax"] = no_parallax;
     result->statistics.valid = valid;
+    watch->lap("triangulate");
   }
 
   StereoGeometry geometry_;
@@ -502,7 +571,14 @@ class SweepMatcher : public Matcher {
   EpipolarFrame frame_;
   std::vector<Level> levels_;
   tbb::enumerable_thread_specific<Scratch> scratch_;
-  cv::Mat cost_, sharpness_, target_;
+  cv::Mat cost_, steep_, claim_, smooth_;  ///< of the finest level
+  std::size_t field_ = 0;                  ///< pixels with a ray
+  float finest_step_ = 0;                  ///< least hypothesis step of any band
+  // Claims on spots of the displaced image, kept on an equal-area map of (phi, theta').
+  std::vector<std::uint32_t> claims_;
+  cv::Size claim_size_;
+  float claim_x_ = 0, claim_y_offset_ = 0;
+  std::vector<std::pair<int, int>> claim_rows_;  ///< by tile, first and last
 };
 
 /// Several displaced images, matched pair by pair; what agrees is averaged by its weight.
