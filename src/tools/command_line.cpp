@@ -19,6 +19,7 @@ namespace omnister::tools {
 
 // One line a subcommand, in the order of --help.
 // (declarations here, table below: kept together so that adding a command touches one place)
+void addCalibrate(CLI::App& app);
 void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
 void addStereo(CLI::App& app);
@@ -27,6 +28,7 @@ void addEvaluate(CLI::App& app);
 namespace {
 
 constexpr AddCommand kCommands[] = {
+    addCalibrate,
     addProject,
     addUnproject,
     addStereo,

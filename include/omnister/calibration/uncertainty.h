@@ -1,0 +1,37 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file How far a calibrated lens can be trusted over its image.
+#pragma once
+
+#include <Eigen/Core>
+#include <opencv2/core/types.hpp>
+#include <optional>
+#include <vector>
+
+#include "omnister/lens/lens_model.h"
+
+namespace omnister {
+
+/// Uncertainty or difference of projection over a grid of the image [px].
+struct ProjectionField {
+  int cols = 0;
+  int rows = 0;
+  cv::Size image_size;
+  std::vector<double> sigma_px;          ///< row by row; NaN outside the field of the lens
+  double rms_px = 0.0;                   ///< over the grid points inside the field
+  double max_px = 0.0;
+
+  double at(int col, int row) const { return sigma_px[static_cast<std::size_t>(row * cols + col)]; }
+};
+
+/// Standard deviation of where a fixed direction of the scene is imaged (root of the trace of its 2x2
+/// covariance) [px], given the covariance of LensModel::parameters(). What a small rotation of the camera
+/// does is taken out, since no calibration with free board poses can tell it from a shift of the centre.
+ProjectionField projectionUncertainty(const LensModel& lens, const Eigen::MatrixXd& covariance,
+                                      cv::Size image_size, int cols = 40);
+
+/// Distance between the projections of two lenses over the field of `lens`, after the best rotation
+/// between them [px].
+ProjectionField projectionDifference(const LensModel& lens, const LensModel& other,
+                                     cv::Size image_size, int cols = 40);
+
+}  // namespace omnister

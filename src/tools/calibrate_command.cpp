@@ -1,0 +1,72 @@
+// SPDX-License-Identifier: Apache-2.0
+// `calibrate`: one camera's lens from images of a board or from corners found elsewhere.
+#include <chrono>
+#include <memory>
+
+#include "calibration_arguments.h"
+#include "omnister/common/error.h"
+
+namespace omnister::tools {
+namespace {
+
+struct Arguments {
+  CalibrationArguments common;
+  std::vector<std::string> images;
+  std::string detections_file;
+  std::string out;
+  bool* json = nullptr;
+};
+
+void run(const Arguments& arguments) {
+  const auto begin = std::chrono::steady_clock::now();
+  const Detections detections =
+      gatherDetections(arguments.common, arguments.images, arguments.detections_file, false);
+  const CalibrationResult result = calibrate(detections, calibrationOptions(arguments.common));
+  for (const std::string& warning : result.warnings) say("warning: " + printable(warning, 1000));
+
+  nlohmann::ordered_json json;
+  json["model"] = result.file.lens->model();
+  json["structure"] = result.file.calibration.notes.at("structure");
+  json["rms_px"] = result.rms_px;
+  json["holdout_rms_px"] = nullptr;
+  if (result.holdout_rms_px) json["holdout_rms_px"] = *result.holdout_rms_px;
+  addFigures(json, {&result});
+  // Images without a board are views too.
+  if (!arguments.images.empty()) json["views"] = arguments.images.size();
+  json["max_theta_rad"] = result.file.lens->maxTheta();
+  json["warnings"] = result.warnings;
+  if (!arguments.out.empty()) writeLensFile(arguments.out, result.file);
+  json["seconds"] = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
+  printResult(*arguments.json, json);
+}
+
+}  // namespace
+
+void addCalibrate(CLI::App& app) {
+  CLI::App* command = app.add_subcommand(
+      "calibrate", "Fit a lens to images of a board, or to corners found in them");
+  const auto arguments = std::make_shared<Arguments>();
+  addCalibrationArguments(*command, arguments->common);
+  command->add_option("images", arguments->images, "Images of the board (with --target)");
+  command->add_option(
+      "--detections", arguments->detections_file,
+      "Corners as CSV: view,u_px,v_px,x_m,y_m,z_m (with --size, instead of images)");
+  command->add_option("--out", arguments->out, "Lens file to write");
+  arguments->json = &addJsonFlag(*command);
+  command->callback([arguments, command] {
+    const bool from_file = !arguments->detections_file.empty();
+    if (from_file == !arguments->images.empty()) {
+      throw CLI::ValidationError("calibrate", from_file ? "takes images or --detections, not both"
+                                                        : "needs images or --detections FILE.csv");
+    }
+    if (from_file && command->count("--size") == 0) {
+      throw CLI::RequiredError("--size WxH (with --detections)");
+    }
+    if (!from_file && arguments->common.target_file.empty()) {
+      throw CLI::RequiredError("--target TARGET.yaml (with images)");
+    }
+    run(*arguments);
+  });
+}
+
+}  // namespace omnister::tools

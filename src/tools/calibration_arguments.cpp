@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "calibration_arguments.h"
+
+#include <algorithm>
+
+#include "omnister/calibration/detector.h"
+#include "omnister/common/error.h"
+
+namespace omnister::tools {
+
+void addCalibrationArguments(CLI::App& command, CalibrationArguments& arguments) {
+  command.add_option("--target", arguments.target_file, "TARGET.yaml of the board in the images");
+  command.add_option("--size", arguments.size, "Image size WxH [px], needed with detections")
+      ->type_name("WxH");
+  std::vector<std::string> models = {"auto"};
+  for (const std::string& name : lensModelNames()) models.push_back(name);
+  command
+      .add_option("--model", arguments.model,
+                  "Lens model; auto chooses by held-out error among structures of all kinds")
+      ->check(CLI::IsMember(models))
+      ->capture_default_str();
+  command
+      .add_option(
+          "--folds", arguments.folds,
+          "Interleaved folds for the held-out error, at least 2 (0: only if a choice needs them)")
+      ->check([](const std::string& text) {
+        return text == "1" ? std::string("1 fold leaves nothing to fit; expected 0 or at least 2")
+                           : std::string();
+      })
+      ->check(CLI::Range(0, 10000));
+  command.add_option("--threads", arguments.threads, "Threads to use (0: every core)")
+      ->check(CLI::Range(0, 1024));
+  command.add_flag("--flat-board", arguments.flat_board,
+                   "Take the board as perfectly flat instead of fitting its bend");
+}
+
+CalibrationOptions calibrationOptions(const CalibrationArguments& arguments) {
+  CalibrationOptions options;
+  options.model = arguments.model;
+  options.folds = arguments.folds;
+  options.board_warp = !arguments.flat_board;
+  options.threads = arguments.threads;
+  options.progress = consoleProgress();
+  return options;
+}
+
+Detections gatherDetections(const CalibrationArguments& arguments,
+                            const std::vector<std::string>& images,
+                            const std::string& detections_file, bool keep_missed) {
+  if (!detections_file.empty()) {
+    return readDetections(detections_file, {arguments.size.width, arguments.size.height});
+  }
+  const Target target = readTarget(arguments.target_file);
+  DetectorOptions options;
+  options.threads = arguments.threads;
+  std::vector<std::string> missed;
+  Detections detections = detectInFiles(images, target, options, &missed, consoleProgress());
+  for (const std::string& name : missed) say("no board found in " + printable(name));
+  if (!keep_missed) return detections;
+  Detections all;
+  all.image_size = detections.image_size;
+  std::size_t next = 0;
+  for (const std::string& image : images) {
+    if (next < detections.views.size() && detections.views[next].name == image) {
+      all.views.push_back(std::move(detections.views[next++]));
+    } else {
+      all.views.emplace_back().name = image;
+    }
+  }
+  if (next != detections.views.size())
+    throw Error("the detected views are not those of the images");
+  return all;
+}
+
+void addFigures(nlohmann::ordered_json& json,
+                const std::vector<const CalibrationResult*>& cameras) {
+  std::size_t views = 0;
+  std::size_t used = 0;
+  int points = 0;
+  for (const CalibrationResult* camera : cameras) {
+    views = std::max(views, camera->views.size());
+    const auto count = std::count_if(camera->views.begin(), camera->views.end(),
+                                     [](const ViewResult& view) { return view.used; });
+    used = std::max(used, static_cast<std::size_t>(count));
+    points += camera->points;
+  }
+  json["views"] = views;
+  json["views_used"] = used;
+  json["points"] = points;
+}
+
+}  // namespace omnister::tools

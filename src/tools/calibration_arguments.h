@@ -1,0 +1,38 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file What `calibrate` and `calibrate-stereo` have in common.
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <string>
+#include <vector>
+
+#include "commands.h"
+#include "omnister/calibration/calibrate.h"
+
+namespace omnister::tools {
+
+struct CalibrationArguments {
+  std::string target_file;
+  Size size;
+  std::string model = "auto";
+  int folds = 0;
+  std::string report_folder;
+  int threads = 0;
+  bool flat_board = false;
+};
+
+/// `--target`, `--size`, `--model`, `--folds`, `--report`, `--threads`, `--flat-board`.
+void addCalibrationArguments(CLI::App& command, CalibrationArguments& arguments);
+
+CalibrationOptions calibrationOptions(const CalibrationArguments& arguments);
+
+/// Corners from a CSV file, or from images with the target. Images without the target are named on
+/// standard error; with `keep_missed` they stay as empty views, so that pairs keep their places.
+Detections gatherDetections(const CalibrationArguments& arguments,
+                            const std::vector<std::string>& images,
+                            const std::string& detections_file, bool keep_missed);
+
+/// Sums of both kinds of calibration under the contract's keys.
+void addFigures(nlohmann::ordered_json& json, const std::vector<const CalibrationResult*>& cameras);
+
+}  // namespace omnister::tools
