@@ -9,6 +9,7 @@
 #include <optional>
 #include <string>
 #include <string_view>
+#include <vector>
 
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
@@ -152,6 +153,35 @@ cv::Mat readImage(const std::filesystem::path& path, ImageColor color, std::size
   }
   if (image.empty()) throw InputError(name, "", "cannot be decoded: the image data is damaged");
   return image;
+}
+
+void checkImagePath(const std::filesystem::path& path) {
+  std::string extension = path.extension().string();
+  for (char& c : extension) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
+  for (const char* known : {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}) {
+    if (extension == known) return;
+  }
+  throw InputError(path.string(), "",
+                   "has no extension of an image, expected .png, .jpg, .tif, .bmp, .pgm or .ppm");
+}
+
+std::unique_ptr<AtomicFile> stageImage(const std::filesystem::path& path, const cv::Mat& image) {
+  checkImagePath(path);
+  std::vector<uchar> bytes;
+  bool encoded = false;
+  try {
+    encoded = cv::imencode(path.extension().string(), image, bytes);
+  } catch (const cv::Exception&) {
+    encoded = false;
+  }
+  if (!encoded) throw InputError(path.string(), "", "cannot hold this image");
+  auto file = std::make_unique<AtomicFile>(path);
+  writeFileAtomically(file->path(), {reinterpret_cast<const char*>(bytes.data()), bytes.size()});
+  return file;
+}
+
+void writeImage(const std::filesystem::path& path, const cv::Mat& image) {
+  stageImage(path, image)->commit();
 }
 
 }  // namespace omnister

@@ -148,12 +148,12 @@ class Frame {
   Frame(const SceneData& scene, const Pose& T_world_camera) : scene_(scene) {
     const Pose T_camera_world = T_world_camera.inverse();
     for (const Surface& surface : scene.surfaces) {
-      const Pose T_local_camera = surface.T_world_local.inverse() * T_world_camera;
+      const Pose T_local_camera = surface.T_local_world * T_world_camera;
       View view;
       view.surface = &surface;
       view.rotation = T_local_camera.linear().cast<float>();
       view.origin = T_local_camera.translation().cast<float>();
-      view.light = (surface.T_world_local.inverse() * scene.light).cast<float>();
+      view.light = (surface.T_local_world * scene.light).cast<float>();
       view.half = surface.half.cast<float>();
       view.middle = surface.middle.cast<float>();
       const Eigen::Vector3d middle(surface.middle.x(), surface.middle.y(), 0.0);

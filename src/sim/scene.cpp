@@ -6,12 +6,12 @@
 #include <algorithm>
 #include <cmath>
 #include <map>
-#include <opencv2/imgcodecs.hpp>
 #include <set>
 #include <utility>
 
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
+#include "omnister/common/image_file.h"
 #include "omnister/common/numbers.h"
 #include "scene_data.h"
 
@@ -19,9 +19,7 @@ namespace omnister::sim {
 namespace {
 
 constexpr std::size_t kMaxFile = 4u << 20;
-constexpr std::size_t kMaxPictureFile = 64u << 20;
 constexpr std::size_t kMaxObjects = 1000;
-constexpr int kMaxPictureSide = 8192;
 constexpr double kDegree = 3.14159265358979324 / 180.0;
 
 std::string quoted(const YAML::Node& node) {
@@ -168,24 +166,12 @@ NoiseParameters readNoise(Block& block) {
 }
 
 cv::Mat readPicture(Block& block, const std::filesystem::path& folder) {
-  const std::filesystem::path path = folder / block.text("file", "the name of an image file");
-  const std::string bytes = readFile(path, kMaxPictureFile);
-  cv::Mat image;
-  try {
-    image = cv::imdecode(
-        cv::Mat(1, static_cast<int>(bytes.size()), CV_8UC1, const_cast<char*>(bytes.data())),
-        cv::IMREAD_COLOR);
-  } catch (const cv::Exception&) {
-    image.release();
-  }
-  if (image.empty())
-    block.fail("file", "'" + printable(path.string()) + "' is not a readable image");
-  if (std::max(image.cols, image.rows) > kMaxPictureSide) {
-    block.fail("file", "has " + std::to_string(image.cols) + "x" + std::to_string(image.rows) +
-                           " pixels, expected at most " + std::to_string(kMaxPictureSide) +
-                           " a side");
-  }
-  return image;
+  const cv::Mat image =
+      readImage(folder / block.text("file", "the name of an image file"), ImageColor::kColor);
+  cv::Mat bytes = image;
+  if (image.depth() == CV_16U) image.convertTo(bytes, CV_8U, 1.0 / 257.0);
+  if (bytes.type() != CV_8UC3) block.fail("file", "is not an image of 8 or 16 bits a channel");
+  return bytes;
 }
 
 TexturePtr readTexture(const YAML::Node& node, const std::string& source, const std::string& place,
@@ -350,6 +336,7 @@ class SceneReader {
       block.fail("type", "is '" + printable(type, 60) + "', expected " + expected);
     }
     surface.T_world_local = readPose(block);
+    surface.T_local_world = surface.T_world_local.inverse();
     block.finish("a " + type);
     if (type == "board") scene.boards.back().T_world_board = surface.T_world_local;
     scene.surfaces.push_back(std::move(surface));
@@ -433,8 +420,8 @@ std::optional<double> Scene::rangeAlong(const Eigen::Vector3d& origin,
   double nearest = kFarthest;
   bool hit = false;
   for (const Surface& surface : data_->surfaces) {
-    const Pose T_local_world = surface.T_world_local.inverse();
-    const auto range = rangeTo(surface, T_local_world * origin, T_local_world.linear() * ray);
+    const auto range =
+        rangeTo(surface, surface.T_local_world * origin, surface.T_local_world.linear() * ray);
     if (range && *range < nearest) {
       nearest = *range;
       hit = true;

@@ -20,6 +20,7 @@ struct Surface {
   enum class Kind { kPlane, kBox, kSphere };
   Kind kind = Kind::kPlane;
   Pose T_world_local = Pose::Identity();
+  Pose T_local_world = Pose::Identity();
   /// Half extent along the local axes [m]. Planes lie in x and y (z is 0) and may be infinite; a
   /// sphere has its radius in each.
   Eigen::Vector3d half = Eigen::Vector3d::Zero();

@@ -24,6 +24,8 @@ void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
 void addStereo(CLI::App& app);
 void addEvaluate(CLI::App& app);
+void addRender(CLI::App& app);
+void addDewarp(CLI::App& app);
 
 namespace {
 
@@ -33,6 +35,8 @@ constexpr AddCommand kCommands[] = {
     addUnproject,
     addStereo,
     addEvaluate,
+    addRender,
+    addDewarp,
     nullptr,
 };
 

@@ -1,10 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-/// @file Images from files of unknown quality.
+/// @file Images from files of unknown quality, and images written whole or not at all.
 #pragma once
 
 #include <cstddef>
 #include <filesystem>
+#include <memory>
 #include <opencv2/core/mat.hpp>
+
+#include "omnister/common/file_io.h"
 
 namespace omnister {
 
@@ -18,5 +21,15 @@ enum class ImageColor { kGray, kColor, kAsIs };
 /// image that is too large
 cv::Mat readImage(const std::filesystem::path& path, ImageColor color = ImageColor::kAsIs,
                   std::size_t max_pixels = 100'000'000);
+
+/// Writes by the extension: PNG, JPEG, TIFF, BMP, PGM or PPM. Atomic.
+/// @throws IoError; InputError for another extension or a depth that the format cannot hold
+void writeImage(const std::filesystem::path& path, const cv::Mat& image);
+
+/// The same up to commit(), for several outputs that appear together or not at all.
+std::unique_ptr<AtomicFile> stageImage(const std::filesystem::path& path, const cv::Mat& image);
+
+/// @throws InputError unless the extension is one that writeImage() takes
+void checkImagePath(const std::filesystem::path& path);
 
 }  // namespace omnister
