@@ -18,9 +18,14 @@ std::vector<detect::Corner> detectCorners(const detect::GrayImage& image, const 
   switch (target.type) {
     case TargetType::kCheckerboard:
       return detect::detectCheckerboard(image, target, budget);
-    default:
-      throw Error("only checkerboards can be detected");
+    case TargetType::kCircles:
+      return detect::detectCircles(image, target, budget);
+    case TargetType::kCharuco:
+      return detect::detectCharuco(image, target, budget);
+    case TargetType::kAprilGrid:
+      return detect::detectAprilGrid(image, target, budget);
   }
+  return {};
 }
 
 }  // namespace
