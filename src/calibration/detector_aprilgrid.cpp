@@ -17,9 +17,11 @@ namespace omnister::detect {
 namespace {
 
 std::vector<Marker> findTags(const cv::Mat& image, const Target& target, double scale, int widen) {
-  ScaledImage copy = scaled(image, scale);
-  cv::Mat searched = copy.image;
-  if (widen > 0) {
+  const ScaledImage copy = scaled(image, scale);
+  cv::Mat searched;
+  if (widen == 0) {
+    searched = copy.image;
+  } else {
     const int size = 2 * widen + 1;
     cv::dilate(copy.image, searched, cv::getStructuringElement(cv::MORPH_RECT, {size, size}));
   }

@@ -8,6 +8,7 @@
 #include <opencv2/imgproc.hpp>
 
 #include "board_detectors.h"
+#include "point_refinement.h"
 
 namespace omnister::detect {
 namespace {
@@ -101,11 +102,18 @@ std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& tar
     for (cv::Point2f& corner : *corners) corner = copy.toOriginal(corner);
     auto ordered = orderGrid(*corners, target, &image.fine);
     if (!ordered || !refine(image.fine, target.cols, target.rows, *ordered)) continue;
-    // Once more, for the refinement may have crossed a line over.
+    // Again, for the refinement may have crossed a line over.
     if (!orderGrid(*ordered, target, &image.fine)) continue;
+    Measured coarse;
+    for (const cv::Point2f& corner : *ordered)
+      coarse.emplace_back(Eigen::Vector2d(corner.x, corner.y));
+    const Expected frames = framesFromGrid(coarse, target);
+    const bool first_square_dark = firstSquareContrast(image.fine, target, frames) >= 0.0;
+    const Measured measured = measurePoints(image.fine, target, frames, first_square_dark);
     std::vector<Corner> result;
     for (std::size_t i = 0; i < ordered->size(); ++i) {
-      result.push_back({static_cast<int>(i), {(*ordered)[i].x, (*ordered)[i].y}});
+      // Under a highlight or a finger edge a corner may fail the test and still be the detector's.
+      result.push_back({static_cast<int>(i), measured[i].value_or(*coarse[i])});
     }
     return result;
   }

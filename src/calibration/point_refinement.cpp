@@ -40,6 +40,167 @@ double clearReach(const Target& target) {
   return target.type == TargetType::kCharuco ? inset : 0.5 * target.square_m;
 }
 
+// The picture of a chess corner: two blurred edges that cross, each bent as a wide-angle lens bends
+// it,
+//     I = mean + slope . d + contrast erf(u / blur) erf(v / blur),  d = pixel - corner,
+//     u = n . d + bend (t . d)^2 with normal n and tangent t of the one edge, v alike of the other.
+struct SaddleFit {
+  enum {
+    kX,
+    kY,
+    kAngle1,
+    kAngle2,
+    kBend1,
+    kBend2,
+    kMean,
+    kContrast,
+    kSlopeX,
+    kSlopeY,
+    kBlur,
+    kCount
+  };
+  using Vector = Eigen::Matrix<double, kCount, 1>;
+  using Matrix = Eigen::Matrix<double, kCount, kCount>;
+
+  struct Sample {
+    double x, y, gray;
+  };
+
+  static double model(const Vector& p, double x, double y, Vector* slope) {
+    const double dx = x - p(kX);
+    const double dy = y - p(kY);
+    double edge[2], steep[2], along[2], across[2], u[2], tx[2], ty[2];
+    for (int i = 0; i < 2; ++i) {
+      tx[i] = std::cos(p(kAngle1 + i));
+      ty[i] = std::sin(p(kAngle1 + i));
+      along[i] = tx[i] * dx + ty[i] * dy;
+      across[i] = -ty[i] * dx + tx[i] * dy;
+      u[i] = (across[i] + p(kBend1 + i) * along[i] * along[i]) / p(kBlur);
+      edge[i] = std::erf(u[i]);
+      steep[i] = M_2_SQRTPI * std::exp(-u[i] * u[i]);
+    }
+    if (slope != nullptr) {
+      slope->setZero();
+      for (int i = 0; i < 2; ++i) {
+        const double gain = p(kContrast) * edge[1 - i] * steep[i] / p(kBlur);
+        const double bend = 2.0 * p(kBend1 + i) * along[i];
+        (*slope)(kX) += gain * (ty[i] - bend * tx[i]);
+        (*slope)(kY) += gain * (-tx[i] - bend * ty[i]);
+        (*slope)(kAngle1 + i) = gain * (-along[i] + bend * across[i]);
+        (*slope)(kBend1 + i) = gain * along[i] * along[i];
+        (*slope)(kBlur) -= gain * u[i];
+      }
+      (*slope)(kMean) = 1.0;
+      (*slope)(kContrast) = edge[0] * edge[1];
+      (*slope)(kSlopeX) = dx;
+      (*slope)(kSlopeY) = dy;
+      (*slope)(kX) -= p(kSlopeX);
+      (*slope)(kY) -= p(kSlopeY);
+    }
+    return p(kMean) + p(kSlopeX) * dx + p(kSlopeY) * dy + p(kContrast) * edge[0] * edge[1];
+  }
+
+  // Bends that no lens makes are held back: half a pixel over the window at one sigma of ten grey
+  // levels.
+  static double cost(const std::vector<Sample>& samples, const Vector& p, double bend_weight,
+                     Matrix* normal, Vector* right) {
+    double sum = bend_weight * (p(kBend1) * p(kBend1) + p(kBend2) * p(kBend2));
+    if (normal != nullptr) {
+      normal->setZero();
+      right->setZero();
+      for (const int i : {kBend1, kBend2}) {
+        (*normal)(i, i) = bend_weight;
+        (*right)(i) = bend_weight * p(i);
+      }
+    }
+    Vector slope;
+    for (const Sample& sample : samples) {
+      const double off =
+          model(p, sample.x, sample.y, normal != nullptr ? &slope : nullptr) - sample.gray;
+      sum += off * off;
+      if (normal == nullptr) continue;
+      normal->selfadjointView<Eigen::Lower>().rankUpdate(slope);
+      *right += off * slope;
+    }
+    return sum;
+  }
+};
+
+// Fits the model above within the four squares around the corner.
+std::optional<Eigen::Vector2d> fitSaddle(const cv::Mat& fine, const Target& target, unsigned dark,
+                                         const LocalFrame& frame) {
+  const double spacing = shorterAxis(frame.jacobian) * target.square_m;
+  const double radius = std::clamp(0.4 * spacing, 3.0, 12.0);
+  const Eigen::Matrix2d inverse = frame.jacobian.inverse();
+  if (!inverse.allFinite()) return std::nullopt;
+  // White stays white only up to the markers, less the blur of their edge.
+  const bool coded = target.type == TargetType::kCharuco;
+  const double clear = clearReach(target) - (coded ? 1.0 / shorterAxis(frame.jacobian) : 0.0);
+  std::vector<SaddleFit::Sample> samples;
+  double low = 1e300;
+  double high = -1e300;
+  const int left = static_cast<int>(std::ceil(frame.pixel.x() - radius));
+  const int top = static_cast<int>(std::ceil(frame.pixel.y() - radius));
+  for (int y = std::max(0, top); y <= std::min(fine.rows - 1.0, frame.pixel.y() + radius); ++y) {
+    for (int x = std::max(0, left); x <= std::min(fine.cols - 1.0, frame.pixel.x() + radius); ++x) {
+      const Eigen::Vector2d offset(x - frame.pixel.x(), y - frame.pixel.y());
+      if (offset.squaredNorm() > radius * radius) continue;
+      const Eigen::Vector2d place = inverse * offset;
+      if (place.cwiseAbs().maxCoeff() > 0.45 * target.square_m) continue;
+      if (coded && place.cwiseAbs().minCoeff() > clear) {
+        const unsigned quadrant = place.y() > 0 ? (place.x() > 0 ? kPlusPlus : kMinusPlus)
+                                                : (place.x() > 0 ? kPlusMinus : kMinusMinus);
+        if ((dark & quadrant) == 0) continue;
+      }
+      const double gray = fine.depth() == CV_8U ? fine.at<uchar>(y, x) : fine.at<float>(y, x);
+      samples.push_back({offset.x(), offset.y(), gray});
+      low = std::min(low, gray);
+      high = std::max(high, gray);
+    }
+  }
+  if (samples.size() < 20) return std::nullopt;
+  SaddleFit::Vector p = SaddleFit::Vector::Zero();
+  p(SaddleFit::kAngle1) = std::atan2(frame.jacobian(1, 0), frame.jacobian(0, 0));
+  p(SaddleFit::kAngle2) = std::atan2(frame.jacobian(1, 1), frame.jacobian(0, 1));
+  p(SaddleFit::kMean) = 0.5 * (low + high);
+  // Left of the x edge and of the y edge is (-x, +y) or (+x, -y): with u, v above, u v < 0 for (+,
+  // +).
+  p(SaddleFit::kContrast) = 0.45 * (high - low) * ((dark & kPlusPlus) != 0 ? 1.0 : -1.0);
+  p(SaddleFit::kBlur) = 1.0;
+  const double start_contrast = p(SaddleFit::kContrast);
+  const double bend_weight = 100.0 * std::pow(radius, 4);
+  SaddleFit::Matrix normal;
+  SaddleFit::Vector right;
+  double cost = SaddleFit::cost(samples, p, bend_weight, &normal, &right);
+  double damping = 1e-3;
+  for (int round = 0; round < 20 && damping < 1e6; ++round) {
+    SaddleFit::Matrix damped = normal;
+    damped.diagonal() *= 1.0 + damping;
+    damped.diagonal().array() += 1e-9;
+    const SaddleFit::Vector step = -damped.selfadjointView<Eigen::Lower>().ldlt().solve(right);
+    if (!step.allFinite()) return std::nullopt;
+    SaddleFit::Vector next = p + step;
+    next(SaddleFit::kBlur) = std::clamp(next(SaddleFit::kBlur), 0.3, 0.5 * radius);
+    const double next_cost = SaddleFit::cost(samples, next, bend_weight, nullptr, nullptr);
+    if (!(next_cost < cost)) {
+      damping *= 10.0;
+      continue;
+    }
+    const bool settled = step.head<2>().norm() < 1e-3;
+    p = next;
+    if (settled) break;
+    cost = SaddleFit::cost(samples, p, bend_weight, &normal, &right);
+    damping *= 0.1;
+  }
+  // The edges must have stayed the edges, and explain most of what is seen.
+  const double rms = std::sqrt(cost / static_cast<double>(samples.size()));
+  if (p(SaddleFit::kContrast) * start_contrast <= 0.0 ||
+      rms > 0.5 * std::abs(p(SaddleFit::kContrast)) || p.head<2>().norm() > 0.5 * radius) {
+    return std::nullopt;
+  }
+  return Eigen::Vector2d(frame.pixel + p.head<2>());
+}
+
 void measureCorners(const cv::Mat& fine, const Target& target, const Expected& expected,
                     bool first_square_dark, Measured& measured) {
   const double reach = clearReach(target);
@@ -54,10 +215,13 @@ void measureCorners(const cv::Mat& fine, const Target& target, const Expected& e
     std::vector<cv::Point2f> corner{
         {static_cast<float>(frame.pixel.x()), static_cast<float>(frame.pixel.y())}};
     if (!refineCorners(fine, {halfWindow(clear)}, corner)[0]) continue;
-    const Eigen::Vector2d pixel(corner[0].x, corner[0].y);
-    if ((pixel - frame.pixel).norm() > std::max(2.0, 0.25 * spacing)) continue;
+    Eigen::Vector2d pixel(corner[0].x, corner[0].y);
+    const double limit = std::max(2.0, 0.25 * spacing);
+    if ((pixel - frame.pixel).norm() > limit) continue;
     const unsigned dark = darkQuadrants(target, static_cast<int>(id), first_square_dark);
     if (cornerContrast(fine, {pixel, frame.jacobian}, dark, 0.8 * reach) < kMinContrast) continue;
+    const auto fitted = fitSaddle(fine, target, dark, {pixel, frame.jacobian});
+    if (fitted && (*fitted - frame.pixel).norm() <= limit) pixel = *fitted;
     measured[id] = pixel;
   }
 }
@@ -70,28 +234,34 @@ struct Side {
   Eigen::Vector3d bend = Eigen::Vector3d::Zero();
 };
 
-// Steps through the side are found on short lines across it: dark inside, light outside.
-std::optional<Side> fitSide(const cv::Mat& fine, const Eigen::Vector2d& begin,
-                            const Eigen::Vector2d& end, const Eigen::Vector2d& inside,
-                            double half) {
+Side chord(const Eigen::Vector2d& begin, const Eigen::Vector2d& end,
+           const Eigen::Vector2d& inside) {
   Side side;
-  const double length = (end - begin).norm();
-  if (!(length > 6.0)) return std::nullopt;
   side.origin = begin;
-  side.along = (end - begin) / length;
+  side.along = (end - begin).normalized();
   side.across = {side.along.y(), -side.along.x()};
   if (side.across.dot(inside - begin) > 0.0) side.across = -side.across;
+  return side;
+}
+
+// Moves a side to where the picture steps from dark to light, found on short lines across it: from
+// `begin` to `end` along the chord and `half` to both sides of where it is now [px].
+bool fitSide(const cv::Mat& fine, double begin, double end, double half, Side& side) {
+  const double length = end - begin;
+  if (!(length > 6.0)) return false;
   constexpr double kStep = 0.5;
   const int steps = std::max(3, static_cast<int>(std::lround(half / kStep)));
   // The corners themselves are rounded by the lens.
   const double inset = std::max(2.0, 0.06 * length);
   std::vector<Eigen::Vector2d> places;
-  for (double s = inset; s <= length - inset; s += 1.0) {
+  for (double s = begin + inset; s <= end - inset; s += 1.0) {
+    const double here = side.bend(0) + side.bend(1) * s + side.bend(2) * s * s;
     double weight = 0.0;
     double moment = 0.0;
     std::optional<double> last;
     for (int k = -steps; k <= steps; ++k) {
-      const auto gray = grayAt(fine, begin + s * side.along + k * kStep * side.across);
+      const double across = here + k * kStep;
+      const auto gray = grayAt(fine, side.origin + s * side.along + across * side.across);
       if (!gray) {
         weight = 0.0;
         break;
@@ -100,15 +270,16 @@ std::optional<Side> fitSide(const cv::Mat& fine, const Eigen::Vector2d& begin,
         // Squared, so that the step outweighs the noise beside it.
         const double rise = (*gray - *last) * (*gray - *last);
         weight += rise;
-        moment += rise * (k - 0.5) * kStep;
+        moment += rise * (across - 0.5 * kStep);
       }
       last = gray;
     }
     if (weight > 25.0) places.emplace_back(s, moment / weight);
   }
-  if (places.size() < 5 || places.size() < 0.6 * (length - 2 * inset)) return std::nullopt;
+  if (places.size() < 5 || places.size() < 0.6 * (length - 2 * inset)) return false;
   // A parabola by least squares, twice more with what is off left less of a say.
   std::vector<double> trust(places.size(), 1.0);
+  Eigen::Vector3d bend = Eigen::Vector3d::Zero();
   for (int round = 0; round < 3; ++round) {
     Eigen::Matrix3d normal = Eigen::Matrix3d::Zero();
     Eigen::Vector3d right = Eigen::Vector3d::Zero();
@@ -118,19 +289,19 @@ std::optional<Side> fitSide(const cv::Mat& fine, const Eigen::Vector2d& begin,
       normal += trust[i] * row * row.transpose();
       right += trust[i] * places[i].y() * row;
     }
-    // Short sides are straight: the bend is held unless there is enough of it to see.
-    normal(2, 2) += 0.02;
-    side.bend = normal.ldlt().solve(right);
+    normal(2, 2) += 1e-3;  // short sides show no bend
+    bend = normal.ldlt().solve(right);
     for (std::size_t i = 0; i < places.size(); ++i) {
       const double s = places[i].x() / length;
-      const double off = std::abs(places[i].y() - side.bend.dot(Eigen::Vector3d(1.0, s, s * s)));
+      const double off = std::abs(places[i].y() - bend.dot(Eigen::Vector3d(1.0, s, s * s)));
       trust[i] = off < 0.15 ? 1.0 : 0.15 / off;
     }
   }
-  side.bend(1) /= length;
-  side.bend(2) /= length * length;
-  if (!side.bend.allFinite()) return std::nullopt;
-  return side;
+  bend(1) /= length;
+  bend(2) /= length * length;
+  if (!bend.allFinite()) return false;
+  side.bend = bend;
+  return true;
 }
 
 std::optional<Eigen::Vector2d> crossing(const Side& a, const Side& b, Eigen::Vector2d point) {
@@ -172,24 +343,28 @@ void measureTags(const cv::Mat& fine, const Target& target, const Expected& expe
       // The lines across a side stay within the black border and the gap.
       const double width = target.square_m * axis * std::min(1.0 / cells, target.spacing);
       const double half = std::clamp(0.9 * width, 1.5, 6.0);
-      std::array<std::optional<Side>, 4> sides;
+      std::array<Side, 4> sides;
+      std::array<bool, 4> fitted{};
       std::array<Eigen::Vector2d, 4> corners;
       for (int i = 0; i < 4; ++i) corners[i] = expected[ids[i]]->pixel;
-      // Again from where the first round says the sides are.
-      for (int round = 0; round < 3; ++round) {
+      for (int i = 0; i < 4; ++i) sides[i] = chord(corners[i], corners[(i + 1) % 4], middle);
+      // Again from where the round before says the sides are, so that the lines across are centred.
+      for (int round = 0; round < 4; ++round) {
         for (int i = 0; i < 4; ++i) {
-          sides[i] = fitSide(fine, corners[i], corners[(i + 1) % 4], middle, half);
+          const double begin = sides[i].along.dot(corners[i] - sides[i].origin);
+          const double end = sides[i].along.dot(corners[(i + 1) % 4] - sides[i].origin);
+          fitted[i] = fitSide(fine, begin, end, half, sides[i]);
         }
         for (int i = 0; i < 4; ++i) {
-          const auto& before = sides[(i + 3) % 4];
-          if (!before || !sides[i]) continue;
-          if (const auto point = crossing(*before, *sides[i], corners[i])) corners[i] = *point;
+          const int before = (i + 3) % 4;
+          if (!fitted[before] || !fitted[i]) continue;
+          if (const auto point = crossing(sides[before], sides[i], corners[i])) corners[i] = *point;
         }
       }
       for (int i = 0; i < 4; ++i) {
-        const auto& before = sides[(i + 3) % 4];
-        if (!before || !sides[i]) continue;
-        const auto point = crossing(*before, *sides[i], corners[i]);
+        const int before = (i + 3) % 4;
+        if (!fitted[before] || !fitted[i]) continue;
+        const auto point = crossing(sides[before], sides[i], corners[i]);
         const LocalFrame& frame = *expected[ids[i]];
         if (!point || (*point - frame.pixel).norm() > std::max(2.0, 2.0 * width)) continue;
         if (!grayAt(fine, *point)) continue;

@@ -1,0 +1,259 @@
+// SPDX-License-Identifier: Apache-2.0
+// Boards drawn by the renderer, so that the truth of every point is known.
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <Eigen/Geometry>
+#include <iostream>
+#include <map>
+#include <opencv2/imgcodecs.hpp>
+#include <opencv2/imgproc.hpp>
+
+#include "omnister/calibration/detector.h"
+#include "omnister/common/numbers.h"
+#include "omnister/lens/lens_models.h"
+#include "omnister/sim/renderer.h"
+#include "omnister/sim/scene.h"
+
+namespace omnister {
+namespace {
+
+struct Placement {
+  double theta_deg;    ///< off the optical axis
+  double azimuth_deg;  ///< around it, from x to y
+  double distance;     ///< of the middle of the board [m]
+  double tilt_deg;     ///< of the board's normal from the line of sight, about the board's x
+  double roll_deg;     ///< about the line of sight
+};
+
+constexpr double kDegree = M_PI / 180.0;
+
+Pose boardPose(const Target& target, const Placement& placement) {
+  const TargetArtwork art = targetArtwork(target);
+  const Eigen::Vector2d middle = 0.5 * (art.min + art.max);
+  // Looking along the line of sight, the picture's down stays the board's down.
+  const Eigen::Matrix3d turn =
+      (Eigen::AngleAxisd(placement.azimuth_deg * kDegree, Eigen::Vector3d::UnitZ()) *
+       Eigen::AngleAxisd(placement.theta_deg * kDegree, Eigen::Vector3d::UnitY()) *
+       Eigen::AngleAxisd(-placement.azimuth_deg * kDegree, Eigen::Vector3d::UnitZ()))
+          .toRotationMatrix();
+  Pose pose = Pose::Identity();
+  pose.linear() = turn * Eigen::AngleAxisd(placement.roll_deg * kDegree, Eigen::Vector3d::UnitZ()) *
+                  Eigen::AngleAxisd(placement.tilt_deg * kDegree, Eigen::Vector3d::UnitX());
+  pose.translation() = turn * Eigen::Vector3d(0, 0, placement.distance) -
+                       pose.linear() * Eigen::Vector3d(middle.x(), middle.y(), 0);
+  return pose;
+}
+
+// 190 degrees across the picture's width.
+LensPtr wideLens(const cv::Size& size) {
+  const double focal = 0.5 * size.width / (95 * kDegree);
+  return makeLens({"conic"}, {0.5 * size.width - 3.3, 0.5 * size.height + 2.7}, focal,
+                  100 * kDegree);
+}
+
+cv::Mat draw(const Target& target, const Pose& pose, const LensModel& lens, const cv::Size& size,
+             double noise = 2.0) {
+  const Eigen::Quaterniond q(pose.linear());
+  const auto list = [](const Eigen::VectorXd& v) {
+    std::string text;
+    for (const double value : v) text += (text.empty() ? "[" : ", ") + formatNumber(value);
+    return text + "]";
+  };
+  const TargetArtwork art = targetArtwork(target);
+  const auto scene = sim::parseScene(
+      "version: 1\nbackground: [110, 110, 110]\nobjects:\n  - {type: board, target: " +
+          formatTarget(target).substr(0, formatTarget(target).size() - 1) +
+          ", position: " + list(pose.translation()) + ", quaternion: " + list(q.coeffs()) +
+          ", margin: " + formatNumber(art.margin) + "}\n",
+      "scene");
+  sim::RenderOptions options;
+  options.supersampling = 4;
+  options.noise_sigma = noise;
+  options.color = false;
+  return sim::render(*scene, lens, size, Pose::Identity(), options).image;
+}
+
+struct Score {
+  int found = 0;    ///< points found
+  int visible = 0;  ///< points inside the picture
+  double sum = 0.0;
+  double worst = 0.0;
+  Eigen::Vector2d bias = Eigen::Vector2d::Zero();
+  int wrong = 0;  ///< more than 1 px off
+
+  void add(const ViewDetections& view, const LensModel& lens, const Pose& pose) {
+    for (std::size_t i = 0; i < view.pixels.size(); ++i) {
+      const auto truth = lens.project(pose * view.points[i]);
+      const Eigen::Vector2d off =
+          truth ? Eigen::Vector2d(view.pixels[i] - *truth) : Eigen::Vector2d(1e3, 1e3);
+      if (off.norm() > 1.0) {
+        ++wrong;
+        continue;
+      }
+      ++found;
+      sum += off.squaredNorm();
+      worst = std::max(worst, off.norm());
+      bias += off;
+    }
+  }
+  double rms() const { return std::sqrt(sum / std::max(1, found)); }
+  Eigen::Vector2d meanOffset() const { return bias / std::max(1, found); }
+};
+
+std::ostream& operator<<(std::ostream& out, const Score& score) {
+  return out << score.found << " of " << score.visible << " points, " << score.rms() << " px RMS, "
+             << score.worst << " worst, offset " << score.meanOffset().transpose() << ", "
+             << score.wrong << " wrong";
+}
+
+int visiblePoints(const Target& target, const LensModel& lens, const Pose& pose,
+                  const cv::Size& size) {
+  int count = 0;
+  for (const auto& point : targetPoints(target)) {
+    const auto pixel = lens.project(pose * point);
+    count += pixel && pixel->x() >= 4 && pixel->y() >= 4 && pixel->x() <= size.width - 5 &&
+             pixel->y() <= size.height - 5;
+  }
+  return count;
+}
+
+// The order of a symmetric pattern that fits the truth best.
+ViewDetections renumbered(const ViewDetections& view, const Target& target, const LensModel& lens,
+                          const Pose& pose) {
+  const auto points = targetPoints(target);
+  if (view.points.size() != points.size()) return view;
+  ViewDetections best = view;
+  double best_sum = 1e300;
+  for (const auto& order : targetSymmetries(target)) {
+    ViewDetections other = view;
+    double sum = 0.0;
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      other.points[i] = points[order[i]];
+      const auto truth = lens.project(pose * other.points[i]);
+      sum += truth ? (*truth - view.pixels[i]).squaredNorm() : 1e6;
+    }
+    if (sum < best_sum) {
+      best_sum = sum;
+      best = other;
+    }
+  }
+  return best;
+}
+
+// Whole in the picture; edges never along the pixels, where the renderer's samples, and not the
+// detector, would say how near an edge can be told.
+const std::vector<Placement> kWhole{
+    {10, 30, 0.35, 35, 20}, {50, 200, 0.34, -30, 10}, {68, 340, 0.36, 20, 75}};
+// Cut off by the picture's rim.
+const std::vector<Placement> kCut{{78, 170, 0.26, 0, 8}};
+
+const cv::Size kSize(1280, 960);
+
+struct Outcome {
+  Score detected;
+  Score guided;
+  int boards = 0;
+  int all = 0;  ///< points of the boards, in the picture or not
+};
+
+Outcome run(const Target& target, const std::vector<Placement>& placements,
+            const std::string& save) {
+  const LensPtr lens = wideLens(kSize);
+  Outcome outcome;
+  int index = 0;
+  for (const Placement& placement : placements) {
+    const Pose pose = boardPose(target, placement);
+    const cv::Mat image = draw(target, pose, *lens, kSize);
+    if (const char* folder = std::getenv("OMNISTER_SAVE_IMAGES")) {
+      cv::imwrite(std::string(folder) + "/" + save + std::to_string(index++) + ".png", image);
+    }
+    const int visible = visiblePoints(target, *lens, pose, kSize);
+    outcome.all += static_cast<int>(targetPoints(target).size());
+    outcome.detected.visible += visible;
+    outcome.guided.visible += visible;
+    const auto view = detectTarget(image, target);
+    if (!view) {
+      std::cout << "  not found at " << placement.theta_deg << " degrees\n";
+      continue;
+    }
+    ++outcome.boards;
+    Score here;
+    here.visible = visible;
+    const ViewDetections numbered = renumbered(*view, target, *lens, pose);
+    here.add(numbered, *lens, pose);
+    outcome.detected.add(numbered, *lens, pose);
+    std::cout << "  " << placement.theta_deg << " degrees: " << here << '\n';
+    const ViewDetections guided = refineGuided(image, target, *lens, numbered);
+    Score after;
+    after.visible = visible;
+    after.add(guided, *lens, pose);
+    std::cout << "      guided: " << after << '\n';
+    outcome.guided.add(guided, *lens, pose);
+  }
+  std::cout << "detected: " << outcome.boards << " boards, " << outcome.detected
+            << "\nguided:   " << outcome.guided << '\n';
+  return outcome;
+}
+
+Target make(const std::string& text) { return parseTarget(text, "test"); }
+
+void expectWhole(const Outcome& outcome, double detected_rms, double guided_rms) {
+  EXPECT_EQ(outcome.boards, static_cast<int>(kWhole.size()));
+  EXPECT_EQ(outcome.detected.wrong, 0);
+  EXPECT_EQ(outcome.guided.wrong, 0);
+  EXPECT_GE(outcome.detected.found, 0.98 * outcome.detected.visible);
+  EXPECT_GE(outcome.guided.found, 0.98 * outcome.guided.visible);
+  EXPECT_LT(outcome.detected.rms(), detected_rms);
+  EXPECT_LT(outcome.guided.rms(), guided_rms);
+  EXPECT_LT(outcome.guided.meanOffset().norm(), 0.015);
+}
+
+void expectCut(const Outcome& outcome, double rms, double share) {
+  EXPECT_EQ(outcome.boards, static_cast<int>(kCut.size()));
+  EXPECT_EQ(outcome.detected.wrong, 0);
+  EXPECT_LT(outcome.detected.visible, outcome.all);
+  EXPECT_GE(outcome.detected.found, share * outcome.detected.visible);
+  EXPECT_LT(outcome.detected.rms(), rms);
+  EXPECT_LT(outcome.guided.rms(), rms);
+}
+
+TEST(RenderedBoard, Checkerboard) {
+  const Target target = make("{type: checkerboard, cols: 8, rows: 6, square_m: 0.03}");
+  expectWhole(run(target, kWhole, "checker"), 0.03, 0.03);
+}
+
+TEST(RenderedBoard, Charuco) {
+  const Target target = make(
+      "{type: charuco, cols: 8, rows: 6, square_m: 0.035, marker_m: 0.026, dictionary: "
+      "DICT_4X4_50}");
+  expectWhole(run(target, kWhole, "charuco"), 0.03, 0.03);
+  expectCut(run(target, kCut, "charuco_cut"), 0.05, 0.9);
+}
+
+TEST(RenderedBoard, AprilGrid) {
+  const Target target = make("{type: aprilgrid, cols: 4, rows: 4, square_m: 0.05, spacing: 0.3}");
+  expectWhole(run(target, kWhole, "april"), 0.05, 0.05);
+  expectCut(run(target, kCut, "april_cut"), 0.08, 0.8);
+}
+
+TEST(RenderedBoard, AprilGridWithJoiningSquares) {
+  const Target target = make(
+      "{type: aprilgrid, cols: 4, rows: 4, square_m: 0.05, spacing: 0.3, joining_squares: true}");
+  expectWhole(run(target, kWhole, "kalibr"), 0.05, 0.05);
+}
+
+// Without a lens, a dot's centroid is not the image of its centre: a tenth of a pixel or two.
+TEST(RenderedBoard, Circles) {
+  const Target target = make("{type: circles, cols: 7, rows: 6, square_m: 0.035}");
+  expectWhole(run(target, kWhole, "circles"), 0.2, 0.015);
+}
+
+TEST(RenderedBoard, AsymmetricCircles) {
+  const Target target =
+      make("{type: circles, cols: 4, rows: 9, square_m: 0.028, asymmetric: true}");
+  expectWhole(run(target, kWhole, "asym"), 0.25, 0.015);
+}
+
+}  // namespace
+}  // namespace omnister
