@@ -40,11 +40,12 @@ double clearReach(const Target& target) {
   return target.type == TargetType::kCharuco ? inset : 0.5 * target.square_m;
 }
 
-// The picture of a chess corner: two blurred edges that cross, each bent as a wide-angle lens bends
-// it,
-//     I = mean + slope . d + contrast erf(u / blur) erf(v / blur),  d = pixel - corner,
+// The picture of a corner: two blurred edges that cross, each bent as a wide-angle lens bends it,
+//     I = mean + slope . d + contrast shape(erf(u / blur), erf(v / blur)),  d = pixel - corner,
 //     u = n . d + bend (t . d)^2 with normal n and tangent t of the one edge, v alike of the other.
-struct SaddleFit {
+// Shape is e f where four squares meet (a saddle), and (1 + s e)(1 + r f) / 2 - 1 for a dark
+// quadrant in the white, which the signs s and r choose.
+struct CornerFit {
   enum {
     kX,
     kY,
@@ -66,7 +67,10 @@ struct SaddleFit {
     double x, y, gray;
   };
 
-  static double model(const Vector& p, double x, double y, Vector* slope) {
+  bool saddle = true;
+  double sign[2] = {1.0, 1.0};  ///< s and r
+
+  double model(const Vector& p, double x, double y, Vector* slope) const {
     const double dx = x - p(kX);
     const double dy = y - p(kY);
     double edge[2], steep[2], along[2], across[2], u[2], tx[2], ty[2];
@@ -79,10 +83,16 @@ struct SaddleFit {
       edge[i] = std::erf(u[i]);
       steep[i] = M_2_SQRTPI * std::exp(-u[i] * u[i]);
     }
+    double shape = edge[0] * edge[1];
+    double rise[2] = {edge[1], edge[0]};  // d(shape)/d(edge)
+    if (!saddle) {
+      shape = 0.5 * (1.0 + sign[0] * edge[0]) * (1.0 + sign[1] * edge[1]) - 1.0;
+      for (int i = 0; i < 2; ++i) rise[i] = 0.5 * sign[i] * (1.0 + sign[1 - i] * edge[1 - i]);
+    }
     if (slope != nullptr) {
       slope->setZero();
       for (int i = 0; i < 2; ++i) {
-        const double gain = p(kContrast) * edge[1 - i] * steep[i] / p(kBlur);
+        const double gain = p(kContrast) * rise[i] * steep[i] / p(kBlur);
         const double bend = 2.0 * p(kBend1 + i) * along[i];
         (*slope)(kX) += gain * (ty[i] - bend * tx[i]);
         (*slope)(kY) += gain * (-tx[i] - bend * ty[i]);
@@ -91,19 +101,19 @@ struct SaddleFit {
         (*slope)(kBlur) -= gain * u[i];
       }
       (*slope)(kMean) = 1.0;
-      (*slope)(kContrast) = edge[0] * edge[1];
+      (*slope)(kContrast) = shape;
       (*slope)(kSlopeX) = dx;
       (*slope)(kSlopeY) = dy;
       (*slope)(kX) -= p(kSlopeX);
       (*slope)(kY) -= p(kSlopeY);
     }
-    return p(kMean) + p(kSlopeX) * dx + p(kSlopeY) * dy + p(kContrast) * edge[0] * edge[1];
+    return p(kMean) + p(kSlopeX) * dx + p(kSlopeY) * dy + p(kContrast) * shape;
   }
 
   // Bends that no lens makes are held back: half a pixel over the window at one sigma of ten grey
   // levels.
-  static double cost(const std::vector<Sample>& samples, const Vector& p, double bend_weight,
-                     Matrix* normal, Vector* right) {
+  double cost(const std::vector<Sample>& samples, const Vector& p, double bend_weight,
+              Matrix* normal, Vector* right) const {
     double sum = bend_weight * (p(kBend1) * p(kBend1) + p(kBend2) * p(kBend2));
     if (normal != nullptr) {
       normal->setZero();
@@ -126,17 +136,37 @@ struct SaddleFit {
   }
 };
 
-// Fits the model above within the four squares around the corner.
-std::optional<Eigen::Vector2d> fitSaddle(const cv::Mat& fine, const Target& target, unsigned dark,
+// Where only a corner's own edges are, in the board's axes about it [m].
+struct Clear {
+  double half = 0.0;   ///< half side of the square looked at
+  unsigned coded = 0;  ///< quadrants with a code inside
+  double inset = 0.0;  ///< how far from the edges the code stays
+};
+
+Clear clearAround(const Target& target, unsigned dark) {
+  if (target.type == TargetType::kAprilGrid) {
+    const double cells = tags::aprilFamily(target.dictionary)->width_at_border;
+    return {std::min(target.spacing, 0.5) * target.square_m, dark, target.square_m / cells};
+  }
+  const unsigned light = (kPlusPlus | kMinusPlus | kMinusMinus | kPlusMinus) & ~dark;
+  const bool charuco = target.type == TargetType::kCharuco;
+  return {0.5 * target.square_m, charuco ? light : 0u, 0.5 * (target.square_m - target.marker_m)};
+}
+
+// Fits the model above around the corner.
+// @param dark quadrants of the four squares that are dark   @param code what the fit must keep out
+// of
+std::optional<Eigen::Vector2d> fitCorner(const cv::Mat& fine, unsigned dark, const Clear& clear,
                                          const LocalFrame& frame) {
-  const double spacing = shorterAxis(frame.jacobian) * target.square_m;
-  const double radius = std::clamp(0.4 * spacing, 3.0, 12.0);
+  const double axis = shorterAxis(frame.jacobian);
+  const double radius = std::clamp(0.8 * clear.half * axis, 3.0, 12.0);
   const Eigen::Matrix2d inverse = frame.jacobian.inverse();
   if (!inverse.allFinite()) return std::nullopt;
-  // White stays white only up to the markers, less the blur of their edge.
-  const bool coded = target.type == TargetType::kCharuco;
-  const double clear = clearReach(target) - (coded ? 1.0 / shorterAxis(frame.jacobian) : 0.0);
-  std::vector<SaddleFit::Sample> samples;
+  // Less the blur of what lies beyond.
+  const double blur = 1.0 / axis;
+  const double half = std::max(clear.half - blur, 0.6 * clear.half);
+  const double inset = std::max(clear.inset - blur, 0.3 * clear.inset);
+  std::vector<CornerFit::Sample> samples;
   double low = 1e300;
   double high = -1e300;
   const int left = static_cast<int>(std::ceil(frame.pixel.x() - radius));
@@ -146,12 +176,10 @@ std::optional<Eigen::Vector2d> fitSaddle(const cv::Mat& fine, const Target& targ
       const Eigen::Vector2d offset(x - frame.pixel.x(), y - frame.pixel.y());
       if (offset.squaredNorm() > radius * radius) continue;
       const Eigen::Vector2d place = inverse * offset;
-      if (place.cwiseAbs().maxCoeff() > 0.45 * target.square_m) continue;
-      if (coded && place.cwiseAbs().minCoeff() > clear) {
-        const unsigned quadrant = place.y() > 0 ? (place.x() > 0 ? kPlusPlus : kMinusPlus)
-                                                : (place.x() > 0 ? kPlusMinus : kMinusMinus);
-        if ((dark & quadrant) == 0) continue;
-      }
+      const unsigned quadrant = place.y() > 0 ? (place.x() > 0 ? kPlusPlus : kMinusPlus)
+                                              : (place.x() > 0 ? kPlusMinus : kMinusMinus);
+      const Eigen::Vector2d off = place.cwiseAbs();
+      if ((clear.coded & quadrant) != 0 ? off.minCoeff() > inset : off.maxCoeff() > half) continue;
       const double gray = fine.depth() == CV_8U ? fine.at<uchar>(y, x) : fine.at<float>(y, x);
       samples.push_back({offset.x(), offset.y(), gray});
       low = std::min(low, gray);
@@ -159,29 +187,36 @@ std::optional<Eigen::Vector2d> fitSaddle(const cv::Mat& fine, const Target& targ
     }
   }
   if (samples.size() < 20) return std::nullopt;
-  SaddleFit::Vector p = SaddleFit::Vector::Zero();
-  p(SaddleFit::kAngle1) = std::atan2(frame.jacobian(1, 0), frame.jacobian(0, 0));
-  p(SaddleFit::kAngle2) = std::atan2(frame.jacobian(1, 1), frame.jacobian(0, 1));
-  p(SaddleFit::kMean) = 0.5 * (low + high);
+  CornerFit::Vector p = CornerFit::Vector::Zero();
+  p(CornerFit::kAngle1) = std::atan2(frame.jacobian(1, 0), frame.jacobian(0, 0));
+  p(CornerFit::kAngle2) = std::atan2(frame.jacobian(1, 1), frame.jacobian(0, 1));
+  p(CornerFit::kMean) = 0.5 * (low + high);
   // Left of the x edge and of the y edge is (-x, +y) or (+x, -y): with u, v above, u v < 0 for (+,
   // +).
-  p(SaddleFit::kContrast) = 0.45 * (high - low) * ((dark & kPlusPlus) != 0 ? 1.0 : -1.0);
-  p(SaddleFit::kBlur) = 1.0;
-  const double start_contrast = p(SaddleFit::kContrast);
+  p(CornerFit::kContrast) = 0.45 * (high - low) * ((dark & kPlusPlus) != 0 ? 1.0 : -1.0);
+  CornerFit fit;
+  if ((dark & (dark - 1)) == 0) {
+    fit.saddle = false;
+    fit.sign[0] = (dark & (kPlusPlus | kMinusPlus)) != 0 ? 1.0 : -1.0;
+    fit.sign[1] = (dark & (kMinusPlus | kMinusMinus)) != 0 ? 1.0 : -1.0;
+    p(CornerFit::kContrast) = -0.45 * (high - low);
+  }
+  p(CornerFit::kBlur) = 1.0;
+  const double start_contrast = p(CornerFit::kContrast);
   const double bend_weight = 100.0 * std::pow(radius, 4);
-  SaddleFit::Matrix normal;
-  SaddleFit::Vector right;
-  double cost = SaddleFit::cost(samples, p, bend_weight, &normal, &right);
+  CornerFit::Matrix normal;
+  CornerFit::Vector right;
+  double cost = fit.cost(samples, p, bend_weight, &normal, &right);
   double damping = 1e-3;
   for (int round = 0; round < 20 && damping < 1e6; ++round) {
-    SaddleFit::Matrix damped = normal;
+    CornerFit::Matrix damped = normal;
     damped.diagonal() *= 1.0 + damping;
     damped.diagonal().array() += 1e-9;
-    const SaddleFit::Vector step = -damped.selfadjointView<Eigen::Lower>().ldlt().solve(right);
+    const CornerFit::Vector step = -damped.selfadjointView<Eigen::Lower>().ldlt().solve(right);
     if (!step.allFinite()) return std::nullopt;
-    SaddleFit::Vector next = p + step;
-    next(SaddleFit::kBlur) = std::clamp(next(SaddleFit::kBlur), 0.3, 0.5 * radius);
-    const double next_cost = SaddleFit::cost(samples, next, bend_weight, nullptr, nullptr);
+    CornerFit::Vector next = p + step;
+    next(CornerFit::kBlur) = std::clamp(next(CornerFit::kBlur), 0.3, 0.5 * radius);
+    const double next_cost = fit.cost(samples, next, bend_weight, nullptr, nullptr);
     if (!(next_cost < cost)) {
       damping *= 10.0;
       continue;
@@ -189,13 +224,13 @@ std::optional<Eigen::Vector2d> fitSaddle(const cv::Mat& fine, const Target& targ
     const bool settled = step.head<2>().norm() < 1e-3;
     p = next;
     if (settled) break;
-    cost = SaddleFit::cost(samples, p, bend_weight, &normal, &right);
+    cost = fit.cost(samples, p, bend_weight, &normal, &right);
     damping *= 0.1;
   }
   // The edges must have stayed the edges, and explain most of what is seen.
   const double rms = std::sqrt(cost / static_cast<double>(samples.size()));
-  if (p(SaddleFit::kContrast) * start_contrast <= 0.0 ||
-      rms > 0.5 * std::abs(p(SaddleFit::kContrast)) || p.head<2>().norm() > 0.5 * radius) {
+  if (p(CornerFit::kContrast) * start_contrast <= 0.0 ||
+      rms > 0.5 * std::abs(p(CornerFit::kContrast)) || p.head<2>().norm() > 0.5 * radius) {
     return std::nullopt;
   }
   return Eigen::Vector2d(frame.pixel + p.head<2>());
@@ -220,7 +255,7 @@ void measureCorners(const cv::Mat& fine, const Target& target, const Expected& e
     if ((pixel - frame.pixel).norm() > limit) continue;
     const unsigned dark = darkQuadrants(target, static_cast<int>(id), first_square_dark);
     if (cornerContrast(fine, {pixel, frame.jacobian}, dark, 0.8 * reach) < kMinContrast) continue;
-    const auto fitted = fitSaddle(fine, target, dark, {pixel, frame.jacobian});
+    const auto fitted = fitCorner(fine, dark, clearAround(target, dark), {pixel, frame.jacobian});
     if (fitted && (*fitted - frame.pixel).norm() <= limit) pixel = *fitted;
     measured[id] = pixel;
   }
@@ -369,6 +404,14 @@ void measureTags(const cv::Mat& fine, const Target& target, const Expected& expe
         if (!point || (*point - frame.pixel).norm() > std::max(2.0, 2.0 * width)) continue;
         if (!grayAt(fine, *point)) continue;
         measured[ids[i]] = *point;
+        // The quadrant of the tag; with joining squares, the one across as well.
+        constexpr unsigned kInside[4] = {kPlusPlus, kMinusPlus, kMinusMinus, kPlusMinus};
+        const unsigned tag = kInside[i];
+        const unsigned dark = target.joining_squares ? tag | kInside[(i + 2) % 4] : tag;
+        Clear clear = clearAround(target, dark);
+        clear.coded = tag;
+        const auto corner = fitCorner(fine, dark, clear, {*point, frame.jacobian});
+        if (corner && (*corner - *point).norm() < 1.0) measured[ids[i]] = *corner;
       }
     }
   }
