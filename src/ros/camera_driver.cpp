@@ -100,7 +100,6 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
     static_frames_->add(toTransformStamped(opticalInLink(), now, link, parameters_.frame_id));
   }
   images_ = image_transport::ImageTransport(node_).advertiseCamera("image_raw", 4);
-  set_camera_info_ = node_.advertiseService("set_camera_info", &CameraDriver::setCameraInfo, this);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
   thread_ = std::thread(&CameraDriver::run, this);
@@ -116,14 +115,21 @@ CameraDriver::~CameraDriver() {
 }
 
 void CameraDriver::waitFor(double seconds) {
-  std::unique_lock<std::mutex> lock(mutex_);
-  wake_.wait_for(lock, std::chrono::duration<double>(seconds), [this] { return stop_.load(); });
+  const Steady::time_point end = Steady::now() + std::chrono::duration_cast<Steady::duration>(
+                                                     std::chrono::duration<double>(seconds));
+  while (!stop_ && Steady::now() < end) {
+    diagnostics_.update();
+    const Steady::time_point slice = std::min(end, Steady::now() + std::chrono::milliseconds(200));
+    std::unique_lock<std::mutex> lock(mutex_);
+    wake_.wait_until(lock, slice, [this] { return stop_.load(); });
+  }
 }
 
 bool CameraDriver::wanted() const { return images_.getNumSubscribers() > 0; }
 
 void CameraDriver::run() {
   while (!stop_) {
+    diagnostics_.update();
     try {
       if (openIfNeeded()) {
         stream();
@@ -155,7 +161,6 @@ bool CameraDriver::openIfNeeded() {
   }
   diagnostics_.setHardwareID(identity.serial);
   ROS_INFO_STREAM("opened " << printable(describe(identity)));
-  told_problem_.clear();
   last_sequence_.reset();
   takeRemarks();
   chooseLens();
@@ -246,6 +251,7 @@ void CameraDriver::countLost(const device::Frame& frame) {
                                 ? frame.sequence - *last_sequence_ - 1
                                 : 0;
   last_sequence_ = frame.sequence;
+  told_problem_.clear();
   const std::lock_guard<std::mutex> lock(mutex_);
   ++frames_;
   lost_ += gap;
@@ -343,24 +349,6 @@ void CameraDriver::setLens(LensFile file) {
     lens_ = std::move(lens);
   }
   lens_publisher_.publish(message);
-}
-
-bool CameraDriver::setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
-                                 sensor_msgs::SetCameraInfo::Response& response) {
-  try {
-    LensFile file = fromCameraInfo(request.camera_info, "set_camera_info");
-    file.camera_name = storeName();
-    const std::filesystem::path path = LensStore(parameters_.store).save(file.camera_name, file);
-    setLens(std::move(file));
-    response.success = true;
-    response.status_message = "saved as " + path.string();
-    ROS_INFO_STREAM("calibration " << response.status_message);
-  } catch (const std::exception& e) {
-    response.success = false;
-    response.status_message = e.what();
-    ROS_WARN_STREAM("set_camera_info refused: " << printable(e.what(), 1000));
-  }
-  return true;
 }
 
 void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {

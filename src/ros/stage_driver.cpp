@@ -88,6 +88,7 @@ void StageDriver::run() {
         lostLocked(e.what());
       }
     }
+    diagnostics_.update();
     next = std::max(next + period, Steady::now());
     std::this_thread::sleep_until(next);
   }
@@ -129,6 +130,20 @@ void StageDriver::lostLocked(const std::string& problem) {
 void StageDriver::pollLocked() {
   if (!openLocked()) return;
   reading_ = stage_->read();
+  if (reading_.moving) seen_moving_ = true;
+  if (homing_ && motionOverLocked(reading_)) {
+    homing_ = false;
+    if (reading_.homed) {
+      ROS_INFO("the stage is homed");
+    } else {
+      ROS_WARN("homing ended without a reference");
+    }
+  }
+  // Whoever waits for the end of homing can move right after it.
+  if (homing_) {
+    reading_.homed = false;
+    reading_.moving = true;
+  }
   publishLocked(reading_);
   superviseLocked(reading_);
 }
@@ -173,7 +188,6 @@ void StageDriver::superviseLocked(const device::StageReading& reading) {
     told_fault_ = reading.fault;
     if (!reading.fault.empty()) ROS_WARN_STREAM("stage fault: " << printable(reading.fault));
   }
-  if (reading.moving) seen_moving_ = true;
   if (std::abs(reading.position_m - progress_position_m_) > kProgress) {
     progress_position_m_ = reading.position_m;
     progress_at_ = Steady::now();
@@ -194,14 +208,6 @@ void StageDriver::superviseLocked(const device::StageReading& reading) {
     homing_ = false;
     progress_at_ = Steady::now();
     if (goal_) goal_->ending = Ending::kStall;
-  }
-  if (homing_ && motionOverLocked(reading)) {
-    homing_ = false;
-    if (reading.homed) {
-      ROS_INFO("the stage is homed");
-    } else {
-      ROS_WARN("homing ended without a reference");
-    }
   }
   if (!goal_) return;
   MoveStageFeedback feedback;

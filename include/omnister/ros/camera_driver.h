@@ -4,14 +4,13 @@
 /// Publishes `image_raw` and `camera_info` with identical headers (stamp: middle of the exposure),
 /// latched `lens_model`, `/diagnostics`, and the static frames of its mount. The device is opened
 /// at once, streams only while someone listens, and is opened again when it was lost. A recording
-/// that knows stage positions also publishes `stage_state` and the stage's tf. Offers
-/// `set_camera_info`.
+/// that knows stage positions also publishes `stage_state` and the stage's tf.
+
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
 #include <image_transport/camera_publisher.h>
 #include <ros/node_handle.h>
-#include <sensor_msgs/SetCameraInfo.h>
 #include <tf2_ros/transform_broadcaster.h>
 
 #include <atomic>
@@ -88,8 +87,6 @@ class CameraDriver {
 
   void chooseLens();
   void setLens(LensFile file);
-  bool setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
-                     sensor_msgs::SetCameraInfo::Response& response);
   std::string storeName() const;
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
@@ -124,7 +121,6 @@ class CameraDriver {
   ros::Publisher lens_publisher_;
   ros::Publisher stage_publisher_;
   diagnostic_updater::Updater diagnostics_;
-  ros::ServiceServer set_camera_info_;
   std::atomic<bool> stop_{false};
   std::thread thread_;
 };

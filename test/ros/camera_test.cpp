@@ -1,0 +1,348 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <gmock/gmock.h>
+#include <tf2_ros/buffer.h>
+#include <tf2_ros/transform_listener.h>
+
+#include <algorithm>
+#include <atomic>
+#include <fstream>
+#include <future>
+#include <opencv2/imgcodecs.hpp>
+#include <thread>
+
+#include "omnister/lens/lens_models.h"
+#include "omnister/ros/camera_driver.h"
+#include "omnister/ros/conversions.h"
+#include "ros/ros_test.h"
+#include "temporary_folder.h"
+
+namespace omnister {
+namespace {
+
+using std::chrono::milliseconds;
+using test::Collector;
+using test::eventually;
+using testing::HasSubstr;
+
+/// What a fake camera did and shall do; outlives the cameras that the driver opens and closes.
+struct FakeState {
+  std::atomic<int> opened{0}, started{0}, stopped{0};
+  std::atomic<bool> absent{false}, unplugged{false};
+  std::atomic<std::uint64_t> sequence{0};
+  std::atomic<std::uint64_t> skip{0};
+};
+
+class FakeCamera : public device::Camera {
+ public:
+  explicit FakeCamera(FakeState* state) : state_(state) {
+    if (state->absent) throw device::CameraError("no such camera");
+    ++state->opened;
+  }
+  device::CameraIdentity identity() const override { return {"test", "fake", "F-1"}; }
+  void start() override { ++state_->started; }
+  void stop() override { ++state_->stopped; }
+  std::optional<device::Frame> grab(milliseconds /*timeout*/) override {
+    std::this_thread::sleep_for(milliseconds(5));
+    if (state_->unplugged) throw device::CameraError("the cable is out");
+    device::Frame frame;
+    frame.image = cv::Mat(6, 8, CV_8UC1, cv::Scalar(7));
+    frame.encoding = "mono8";
+    frame.stamp = device::now();
+    frame.sequence = state_->sequence += 1 + state_->skip.exchange(0);
+    return frame;
+  }
+
+ private:
+  FakeState* state_;
+};
+
+class CameraTest : public testing::Test {
+ protected:
+  CameraTest()
+      : node_("camera_" + std::to_string(++count_)),
+        private_("~" + node_.getNamespace().substr(1)) {
+    parameters_.store = (folder_.path() / "store").string();
+    parameters_.retry_period_s = 0.05;
+  }
+
+  void openFake() {
+    driver_ = std::make_unique<CameraDriver>(
+        node_, private_, parameters_,
+        [this](const CameraParameters&) { return std::make_unique<FakeCamera>(&state_); });
+  }
+
+  /// A recording of `count` images whose first pixel is their number.
+  void record(int count, double rate, const std::string& more_of_frame = "") {
+    std::ofstream list(folder_.path() / "replay.yaml");
+    list << "version: 1\nrate: " << rate << "\nframes:\n";
+    for (int i = 0; i < count; ++i) {
+      const std::string name = std::to_string(i) + ".png";
+      ASSERT_TRUE(
+          cv::imwrite((folder_.path() / name).string(), cv::Mat(6, 8, CV_8UC1, cv::Scalar(i))));
+      list << "  - {image: " << name << more_of_frame << "}\n";
+    }
+    parameters_.device = "replay:" + folder_.path().string();
+  }
+
+  LensFile lens() const {
+    LensFile file;
+    file.image_size = {8, 6};
+    LensStructure structure;
+    structure.model = "conic";
+    file.lens = makeLens(structure, Eigen::Vector2d(3.5, 2.5), 4.0, 1.2);
+    return file;
+  }
+
+  static int count_;
+  ros::NodeHandle node_, private_;
+  test::TemporaryFolder folder_;
+  CameraParameters parameters_;
+  FakeState state_;
+  std::unique_ptr<CameraDriver> driver_;  // goes first
+};
+int CameraTest::count_ = 0;
+
+TEST_F(CameraTest, StreamsOnlyWhileSomeoneListens) {
+  openFake();
+  ASSERT_TRUE(eventually([&] { return state_.opened == 1; }));
+  std::this_thread::sleep_for(milliseconds(200));
+  EXPECT_EQ(state_.started, 0);
+  for (int round = 1; round <= 2; ++round) {
+    {
+      // The information alone is worth streaming, too.
+      Collector<sensor_msgs::Image> images(node_, round == 1 ? "image_raw" : "unused");
+      Collector<sensor_msgs::CameraInfo> infos(node_, round == 1 ? "unused" : "camera_info");
+      ASSERT_TRUE(eventually([&] { return images.size() + infos.size() >= 3; }));
+      EXPECT_EQ(state_.started, round);
+      EXPECT_EQ(state_.stopped, round - 1);
+    }
+    ASSERT_TRUE(eventually([&] { return state_.stopped == round; }));
+  }
+  EXPECT_EQ(state_.opened, 1);
+}
+
+TEST_F(CameraTest, ImageAndInformationHaveTheSameHeaderAndNoneIsLost) {
+  constexpr int kFrames = 40;
+  record(kFrames, 50.0);
+  parameters_.frame_id = "wide_optical";
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  driver_ = std::make_unique<CameraDriver>(node_, private_, parameters_);
+  ASSERT_TRUE(eventually([&] {
+    return images.size() > 0 && infos.size() > 0 && images.last()->data[0] == kFrames - 1 &&
+           infos.last()->header.stamp == images.last()->header.stamp;
+  }));
+  const auto got = images.messages();
+  int compared = 0;
+  for (const auto& image : got) {
+    EXPECT_EQ(image->header.frame_id, "wide_optical");
+    EXPECT_EQ(image->encoding, "mono8");
+    for (const auto& info : infos.messages()) {
+      if (info->header.stamp != image->header.stamp) continue;
+      EXPECT_EQ(info->header.frame_id, image->header.frame_id);
+      EXPECT_EQ(info->width, image->width);
+      EXPECT_EQ(info->height, image->height);
+      EXPECT_EQ(info->K[0], 0.0);  // not calibrated
+      ++compared;
+    }
+  }
+  // The second subscriber may join a few frames after the first.
+  EXPECT_GE(compared, kFrames - 10);
+  for (std::size_t i = 1; i < got.size(); ++i) {
+    EXPECT_EQ(got[i]->data[0], got[i - 1]->data[0] + 1);
+    EXPECT_NEAR((got[i]->header.stamp - got[i - 1]->header.stamp).toSec(), 0.02, 1e-6);
+  }
+}
+
+TEST_F(CameraTest, ComesBackAfterALoss) {
+  state_.absent = true;
+  openFake();
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  std::this_thread::sleep_for(milliseconds(200));
+  EXPECT_EQ(images.size(), 0u);
+  state_.absent = false;
+  ASSERT_TRUE(eventually([&] { return images.size() >= 3; }));
+  for (int round = 0; round < 5; ++round) {
+    const int before = state_.opened;
+    state_.unplugged = true;
+    std::this_thread::sleep_for(milliseconds(100));
+    state_.unplugged = false;
+    ASSERT_TRUE(eventually([&] { return state_.opened > before; }));
+    const std::size_t had = images.size();
+    ASSERT_TRUE(eventually([&] { return images.size() > had + 2; }));
+  }
+}
+
+TEST_F(CameraTest, TheConstructorDoesNotWaitForTheDevice) {
+  std::promise<void> release;
+  std::shared_future<void> released(release.get_future());
+  std::atomic<bool> asked{false};
+  {
+    CameraDriver driver(node_, private_, parameters_, [&](const CameraParameters&) {
+      asked = true;
+      released.wait();
+      return std::make_unique<FakeCamera>(&state_);
+    });
+    // Here the device is still being opened, and so it would stay for ever.
+    ASSERT_TRUE(eventually([&] { return asked.load(); }));
+    EXPECT_EQ(state_.opened, 0);
+    release.set_value();
+  }
+  EXPECT_EQ(state_.started, 0);
+}
+
+TEST_F(CameraTest, DiagnosticsCountLostFrames) {
+  Collector<diagnostic_msgs::DiagnosticArray> diagnostics(ros::NodeHandle(), "/diagnostics");
+  openFake();
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  ASSERT_TRUE(eventually([&] { return images.size() >= 3; }));
+  state_.skip = 4;
+  const auto value = [&](const std::string& key) -> std::string {
+    std::string found;
+    for (const auto& array : diagnostics.messages()) {
+      for (const auto& status : array->status) {
+        if (status.hardware_id != "F-1" ||
+            status.name.find(private_.getNamespace().substr(1)) == std::string::npos) {
+          continue;
+        }
+        for (const auto& entry : status.values) {
+          if (entry.key == key) found = entry.value;
+        }
+      }
+    }
+    return found;
+  };
+  EXPECT_TRUE(eventually([&] { return value("frames lost") == "4"; }));
+  EXPECT_EQ(value("state"), "streaming");
+}
+
+TEST_F(CameraTest, PublishesTheLensOfItsParameter) {
+  const LensFile file = lens();
+  parameters_.lens = (folder_.path() / "lens.yaml").string();
+  writeLensFile(parameters_.lens, file);
+  openFake();
+  Collector<LensModelMessage> models(node_, "lens_model");  // latched: comes later, sees it still
+  ASSERT_TRUE(eventually([&] { return models.size() == 1; }));
+  const LensFile back = fromLensModelMessage(*models.last(), "lens_model");
+  EXPECT_EQ(back.lens->model(), "conic");
+  EXPECT_EQ(models.last()->header.frame_id, parameters_.frame_id);
+  EXPECT_EQ(back.lens->parameters(), file.lens->parameters());
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
+  const sensor_msgs::CameraInfo expected = toCameraInfo(file);
+  EXPECT_EQ(infos.last()->K, expected.K);
+  EXPECT_EQ(infos.last()->D, expected.D);
+  EXPECT_EQ(infos.last()->distortion_model, expected.distortion_model);
+}
+
+TEST_F(CameraTest, ALensOfAnotherImageSizeIsNotPublishedAsCalibration) {
+  LensFile file = lens();
+  file.image_size = {16, 12};
+  parameters_.lens = (folder_.path() / "lens.yaml").string();
+  writeLensFile(parameters_.lens, file);
+  openFake();
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
+  EXPECT_EQ(infos.last()->K[0], 0.0);
+  EXPECT_EQ(infos.last()->width, 8u);
+}
+
+TEST_F(CameraTest, ABrokenLensParameterIsAnError) {
+  parameters_.lens = (folder_.path() / "none.yaml").string();
+  EXPECT_THROW(openFake(), Error);
+  std::ofstream(parameters_.lens) << "image_width: 8\n";
+  EXPECT_THROW(openFake(), Error);
+}
+
+TEST_F(CameraTest, ACorruptStoreStartsUncalibrated) {
+  std::filesystem::create_directories(parameters_.store);
+  std::ofstream(LensStore(parameters_.store).pathOf("F-1")) << "lens_surface: {";
+  openFake();
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
+  EXPECT_EQ(infos.last()->K[0], 0.0);
+}
+
+TEST_F(CameraTest, ARecordedStageIsPublishedBesideItsImages) {
+  record(5, 20.0, ", stage_position_m: 0.25, settled: true");
+  parameters_.axis = Eigen::Vector3d::UnitY();
+  parameters_.parent_frame_id = "stage_carriage";
+  parameters_.settings.loop = true;
+  tf2_ros::Buffer buffer;
+  const tf2_ros::TransformListener listener(buffer);
+  driver_ = std::make_unique<CameraDriver>(node_, private_, parameters_);
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  Collector<StageState> states(node_, "stage_state");
+  ASSERT_TRUE(eventually([&] {
+    return images.size() > 0 && states.size() > 0 &&
+           buffer.canTransform("stage_base", "camera_optical", images.last()->header.stamp);
+  }));
+  EXPECT_EQ(states.last()->position, 0.25);
+  EXPECT_FALSE(states.last()->moving);
+  const Pose pose = fromTransform(
+      buffer.lookupTransform("stage_base", "camera_optical", images.last()->header.stamp).transform,
+      "tf");
+  EXPECT_NEAR((pose.translation() - Eigen::Vector3d(0, 0.25, 0)).norm(), 0.0, 1e-12);
+  // The camera looks along the link's x.
+  EXPECT_NEAR((pose.linear() * Eigen::Vector3d::UnitZ() - Eigen::Vector3d::UnitX()).norm(), 0.0,
+              1e-12);
+  EXPECT_NEAR((pose.linear() * Eigen::Vector3d::UnitX() + Eigen::Vector3d::UnitY()).norm(), 0.0,
+              1e-12);
+}
+
+TEST_F(CameraTest, RefusesParametersByKeyValueAndRange) {
+  const auto refusal = [&](const std::string& key,
+                           const XmlRpc::XmlRpcValue& value) -> std::string {
+    private_.setParam(key, value);
+    std::string message;
+    try {
+      loadCameraParameters(private_);
+    } catch (const InputError& e) {
+      message = e.what();
+    }
+    private_.deleteParam(key);
+    return message;
+  };
+  EXPECT_EQ(refusal("frame_rate", 25.0), "");
+  EXPECT_EQ(refusal("frame_rate", 25), "");
+  EXPECT_THAT(refusal("frame_rate", -1.0),
+              testing::AllOf(HasSubstr("frame_rate"), HasSubstr("-1"), HasSubstr("1000")));
+  EXPECT_THAT(refusal("frame_rate", std::nan("")), HasSubstr("frame_rate"));
+  EXPECT_THAT(refusal("frame_rate", "fast"), HasSubstr("fast"));
+  EXPECT_THAT(refusal("exposure_us", 0), HasSubstr("exposure_us"));
+  EXPECT_THAT(refusal("trigger", "sometimes"), HasSubstr("software"));
+  EXPECT_THAT(refusal("frame_id", "/camera"), HasSubstr("frame_id"));
+  EXPECT_THAT(refusal("frame_id", ""), HasSubstr("frame_id"));
+  EXPECT_THAT(refusal("name", "../evil"), HasSubstr("evil"));
+  EXPECT_THAT(refusal("name", "a/b"), HasSubstr("a/b"));
+  EXPECT_THAT(refusal("mount", "1 2 3"), HasSubstr("mount"));
+  EXPECT_THAT(refusal("mount", "0 0 0 0 0 0 0"), HasSubstr("mount"));
+  EXPECT_THAT(refusal("axis", "0 0 0"), HasSubstr("axis"));
+  EXPECT_THAT(refusal("camera_info_url", "http://there"), HasSubstr("camera_info_url"));
+  EXPECT_EQ(refusal("camera_info_url", "file:///there.yaml"), "");
+}
+
+TEST_F(CameraTest, TheStoreNeverLeavesItsFolder) {
+  const LensStore store(parameters_.store);
+  for (const char* name : {"..", "../x", "a/b", "/etc/passwd", "", ".hidden", "a b", "a\nb"}) {
+    EXPECT_THROW(store.save(name, lens()), InputError) << name;
+    EXPECT_THROW(store.load(name), InputError) << name;
+  }
+  EXPECT_EQ(store.load("none"), std::nullopt);
+  store.save("a-1", lens());
+  store.save("a-1", lens());
+  EXPECT_TRUE(store.load("a-1"));
+  EXPECT_TRUE(std::filesystem::exists(store.folder() / "a-1.yaml~"));
+  std::filesystem::create_symlink(folder_.path() / "outside.yaml", store.folder() / "link.yaml");
+  EXPECT_THROW(store.save("link", lens()), InputError);
+  EXPECT_THROW(store.load("link"), InputError);
+  EXPECT_FALSE(std::filesystem::exists(folder_.path() / "outside.yaml"));
+  EXPECT_EQ(LensStore::nameFrom("Basler (A/1)"), "Basler__A_1_");
+  EXPECT_NO_THROW(store.pathOf(LensStore::nameFrom("../../x")));
+  EXPECT_NO_THROW(store.pathOf(LensStore::nameFrom("")));
+}
+
+}  // namespace
+}  // namespace omnister
+
+int main(int argc, char** argv) { return omnister::test::runTests(argc, argv, "camera_test"); }
