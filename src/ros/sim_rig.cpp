@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/ros/sim_rig.h"
 
+#include <algorithm>
+#include <vector>
+
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/parameters.h"
 
@@ -32,6 +35,8 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
   SimRigParameters p;
   p.scene = source.text("scene", "");
   p.lens = source.text("lens", "");
+  p.boards = source.text("boards", "");
+  p.board_hold_s = source.number("board_hold", p.board_hold_s, 0.01, 3600.0, "s");
   p.camera_pose = source.pose("camera_pose", p.camera_pose);
   p.stage.travel_m = source.number("travel", p.stage.travel_m, 1e-3, 100.0, "m");
   p.stage.max_speed_mps = source.number("max_speed", p.stage.max_speed_mps, 1e-6, 100.0, "m/s");
@@ -42,6 +47,7 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
   p.stage.start_m = source.number("start", p.stage.start_m, 0.0, p.stage.travel_m, "m");
   p.stage.homed = source.flag("homed", p.stage.homed);
   p.render.supersampling = source.integer("supersampling", 2, 1, 16);
+  p.render.adaptive = source.flag("adaptive", false);
   p.render.noise_sigma = source.number("noise", 0.0, 0.0, 255.0, "grey levels");
   p.render.vignetting = source.number("vignetting", 0.0, 0.0, 1.0);
   p.render.seed = static_cast<std::uint64_t>(source.integer("seed", 1, 0, 2147483647));
@@ -53,8 +59,17 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
 
 SimRig::SimRig(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
                const SimRigParameters& parameters)
-    : stage_(std::make_shared<sim::SimulatedStage>(parameters.stage)) {
+    : board_since_(std::make_shared<std::atomic<std::int64_t>>(0)),
+      stage_(std::make_shared<sim::SimulatedStage>(parameters.stage)) {
   const sim::ScenePtr scene = sim::readScene(parameters.scene);
+  std::vector<sim::ScenePtr> with_board;
+  if (!parameters.boards.empty()) {
+    const sim::ScenePtr boards = sim::readScene(parameters.boards);
+    for (std::size_t i = 0; i < boards->boards().size(); ++i) {
+      with_board.push_back(sim::withBoard(*scene, *boards, i));
+    }
+    if (with_board.empty()) throw InputError(parameters.boards, "objects", "hold no board");
+  }
   const LensFile truth = readLensFile(parameters.lens);
 
   const ros::NodeHandle stage_private(private_node, "stage");
@@ -77,7 +92,26 @@ SimRig::SimRig(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
     return T_world_base * Eigen::Translation3d(axis * stage->truePosition(time)) *
            T_carriage_optical;
   };
-  const sim::SceneAt scene_at = [scene](device::Stamp) { return scene; };
+  const sim::SceneAt scene_at = [scene, with_board, since = board_since_,
+                                 hold = parameters.board_hold_s](device::Stamp time) {
+    const std::int64_t begin = since->load();
+    if (begin == 0 || with_board.empty()) return scene;
+    const double shown = 1e-9 * static_cast<double>(time.time_since_epoch().count() - begin);
+    return with_board[static_cast<std::size_t>(std::max(0.0, shown / hold)) % with_board.size()];
+  };
+  if (!with_board.empty()) {
+    using Request = std_srvs::SetBool::Request;
+    using Response = std_srvs::SetBool::Response;
+    ros::NodeHandle service_node = private_node;
+    show_board_ = service_node.advertiseService<Request, Response>(
+        "show_board",
+        [since = board_since_, poses = with_board.size()](Request& request, Response& response) {
+          since->store(request.data ? device::now().time_since_epoch().count() : 0);
+          response.success = true;
+          response.message = request.data ? std::to_string(poses) + " poses" : "gone";
+          return true;
+        });
+  }
 
   stage_driver_ = std::make_unique<StageDriver>(
       ros::NodeHandle(node, "stage"), stage_private, stage_parameters,

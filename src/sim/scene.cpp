@@ -446,4 +446,22 @@ ScenePtr readScene(const std::filesystem::path& path) {
   return parseScene(readFile(path, kMaxFile), path.string(), path.parent_path());
 }
 
+ScenePtr withBoard(const Scene& scene, const Scene& boards, std::size_t index) {
+  const SceneData& source = boards.data();
+  if (index >= source.boards.size()) {
+    throw Error("the scene has " + std::to_string(source.boards.size()) +
+                " boards, none of number " + std::to_string(index));
+  }
+  auto data = std::make_unique<SceneData>(scene.data());
+  data->boards.push_back(source.boards[index]);
+  // Boards are the sharp surfaces, in the same order.
+  for (const Surface& surface : source.surfaces) {
+    if (surface.sharp && index-- == 0) {
+      data->surfaces.push_back(surface);
+      break;
+    }
+  }
+  return std::make_shared<const Scene>(std::move(data));
+}
+
 }  // namespace omnister::sim

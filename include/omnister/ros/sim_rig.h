@@ -6,10 +6,16 @@
 /// Parameters of the camera's body are read from `~camera/…`, of the stage's from `~stage/…`, of
 /// the simulation from `~…`. Note that `~lens` is the lens that the camera truly has; what its
 /// driver knows of it is `~camera/lens`, nothing by default.
+///
+/// With `~boards`, the service `~show_board` (std_srvs/SetBool) begins and ends the carrying of a
+/// calibration board before the camera, as a person would: it rests at one pose after the other.
 #pragma once
 
 #include <ros/node_handle.h>
+#include <std_srvs/SetBool.h>
 
+#include <atomic>
+#include <cstdint>
 #include <memory>
 #include <string>
 
@@ -23,12 +29,14 @@ namespace omnister {
 
 /// Private parameters of the same names.
 struct SimRigParameters {
-  std::string scene;                    ///< scene file
-  std::string lens;                     ///< lens file: the true lens and its image size
+  std::string scene;          ///< scene file
+  std::string lens;           ///< lens file: the true lens and its image size
+  std::string boards;         ///< scene file that lists the poses of the board; may be empty
+  double board_hold_s = 1.0;  ///< at each pose
   Pose camera_pose = Pose::Identity();  ///< T_world_optical at stage position 0
   sim::SimulatedStageOptions
       stage;                   ///< travel, max_speed, acceleration, homing_speed, start, homed
-  sim::RenderOptions render;   ///< supersampling, noise, vignetting, seed, color, threads
+  sim::RenderOptions render;   ///< supersampling, adaptive, noise, vignetting, seed, color, threads
   double frame_rate_hz = 5.0;  ///< where ~camera/frame_rate names none
   double exposure_s = 0.005;   ///< where ~camera/exposure_us names none
 };
@@ -43,6 +51,9 @@ class SimRig {
          const SimRigParameters& parameters);
 
  private:
+  /// When the board came in [ns since the epoch]; 0: it is not there.
+  std::shared_ptr<std::atomic<std::int64_t>> board_since_;
+  ros::ServiceServer show_board_;
   std::shared_ptr<sim::SimulatedStage> stage_;
   std::unique_ptr<StageDriver> stage_driver_;
   std::unique_ptr<CameraDriver> camera_driver_;

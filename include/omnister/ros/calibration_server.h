@@ -1,0 +1,101 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file Body of the calibration nodelet: collects views of a target, fits the lens, commits it.
+#pragma once
+
+#include <actionlib/client/simple_action_client.h>
+#include <actionlib/server/simple_action_server.h>
+#include <diagnostic_updater/diagnostic_updater.h>
+#include <image_transport/image_transport.h>
+#include <omnister/CalibrateAction.h>
+#include <omnister/MoveStageAction.h>
+#include <ros/ros.h>
+
+#include <condition_variable>
+#include <filesystem>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+
+#include "omnister/calibration/calibrate.h"
+#include "omnister/calibration/detector.h"
+#include "omnister/calibration/target.h"
+#include "omnister/ros/messages.h"
+#include "omnister/ros/parameters.h"
+#include "omnister/ros/view_collector.h"
+
+namespace omnister {
+
+/// Private parameters of the calibration node.
+struct CalibrationParameters {
+  Target target;
+  std::string model = "auto";
+  std::filesystem::path store;         ///< folder that lens files go to, see LensStore
+  std::string camera_name = "camera";  ///< name of the lens file in it
+  int views = 25;
+  double timeout = 300.0;  ///< until enough views are there [s]
+  double dwell = 5.0;      ///< longest wait for a view at each stage position [s]
+  CollectorOptions collector;
+  DetectorOptions detector;
+};
+
+/// @throws InputError naming key, value and range, or the target file
+CalibrationParameters loadCalibrationParameters(Parameters& parameters);
+
+/// Action `calibrate`. Subscribes to `image_raw` only while it runs. Publishes `coverage` (while
+/// somebody listens) and latched `lens_model`. Views go to `<store>/<camera_name>_detections.csv`
+/// before the fit, the lens to `<store>/<camera_name>.yaml`; both whole or not at all.
+class CalibrationServer {
+ public:
+  /// Returns at once. @throws Error for parameters that do not hold
+  CalibrationServer(const ros::NodeHandle& node, const ros::NodeHandle& private_node);
+  ~CalibrationServer();
+  CalibrationServer(const CalibrationServer&) = delete;
+  CalibrationServer& operator=(const CalibrationServer&) = delete;
+
+ private:
+  using Server = actionlib::SimpleActionServer<CalibrateAction>;
+  using Mover = actionlib::SimpleActionClient<MoveStageAction>;
+  /// The goal was cancelled or replaced, or the node goes down.
+  struct Preempted {};
+
+  void execute(const CalibrateGoalConstPtr& goal);
+  CalibrateResult calibrateOnce(const CalibrateGoal& goal);
+  void moveTo(double position);
+  /// Waits until enough views are there, or `seconds` have passed. @return false after the time
+  bool waitForViews(std::size_t views, double seconds);
+  void checkPreempted();
+  void feedback(const std::string& stage);
+  void onImage(const sensor_msgs::ImageConstPtr& image);
+  void run();
+  void look(const sensor_msgs::ImageConstPtr& image);
+  void publishLens(const LensFile& file, const std::string& frame_id);
+  void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
+
+  const CalibrationParameters parameters_;
+  ros::NodeHandle node_;
+  image_transport::ImageTransport transport_;
+  image_transport::Subscriber image_subscriber_;
+  ros::Publisher lens_publisher_;
+  ros::Publisher coverage_publisher_;
+
+  std::mutex mutex_;  ///< all below
+  std::condition_variable wake_;
+  std::condition_variable progress_;
+  bool stopping_ = false;
+  sensor_msgs::ImageConstPtr newest_;  ///< not yet looked at; older ones are dropped
+  std::optional<ViewCollector> collector_;
+  std::string frame_id_;
+  std::string state_ = "idle";
+  std::string last_problem_;
+  std::size_t dropped_ = 0;
+
+  std::thread worker_;
+  std::unique_ptr<Mover> mover_;
+  std::unique_ptr<Server> server_;
+  diagnostic_updater::Updater diagnostics_;
+  ros::SteadyTimer diagnostics_timer_;
+};
+
+}  // namespace omnister

@@ -1,0 +1,30 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file Image messages from anyone to 8-bit images for matching and detecting.
+#pragma once
+
+#include <sensor_msgs/Image.h>
+
+#include <opencv2/core/mat.hpp>
+#include <string>
+
+namespace omnister {
+
+/// Refuses an image message that cannot be what it says, beyond checkImage(): no stamp, no
+/// frame_id, no picture of 8 or 16 bits, or another size than expected.
+/// @param expected [px]; empty: any size
+/// @throws InputError naming the topic and what is wrong
+void checkFrame(const sensor_msgs::Image& image, cv::Size expected, const std::string& topic);
+
+/// How many bits the brightest sample needs: 8 for 8-bit images, 9 to 16 for 16-bit ones (cameras
+/// leave the upper bits empty).
+int significantBits(const sensor_msgs::Image& image);
+
+/// CV_8UC1. Bayer is debayered, colour turned to grey; 16-bit samples are divided by 2^(bits - 8).
+/// @param bits from significantBits(), the same for all images of a set
+/// @throws InputError for an encoding that is no picture (32FC1, say)
+cv::Mat toGray(const sensor_msgs::Image& image, int bits);
+
+/// CV_8UC3, BGR; else as toGray().
+cv::Mat toBgr(const sensor_msgs::Image& image, int bits);
+
+}  // namespace omnister

@@ -1,0 +1,22 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file Stereo results as messages.
+#pragma once
+
+#include <sensor_msgs/Image.h>
+#include <sensor_msgs/PointCloud2.h>
+
+#include "omnister/stereo/cloud.h"
+
+namespace omnister {
+
+/// Organized cloud on the reference image's grid: x y z [m], rgb (packed as PCL and rviz read it),
+/// sigma [m], score (0 to 1), all float32; NaN where invalid (REP 117). is_dense is false.
+sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Header& header);
+
+/// 32FC1 [m]: distance along z (REP 118), NaN for rays at or past 90 degrees and where invalid.
+sensor_msgs::ImagePtr toDepth(const Cloud& cloud, const std_msgs::Header& header);
+
+/// 32FC1 [m]: distance along the ray, NaN where invalid.
+sensor_msgs::ImagePtr toRange(const cv::Mat& range, const std_msgs::Header& header);
+
+}  // namespace omnister

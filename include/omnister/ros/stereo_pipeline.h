@@ -1,0 +1,141 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file Body of the stereo node and nodelet: images in, organized clouds out.
+#pragma once
+
+#include <diagnostic_updater/diagnostic_updater.h>
+#include <image_transport/image_transport.h>
+#include <image_transport/subscriber_filter.h>
+#include <message_filters/sync_policies/approximate_time.h>
+#include <message_filters/synchronizer.h>
+#include <ros/ros.h>
+#include <tf2_ros/buffer.h>
+#include <tf2_ros/transform_listener.h>
+
+#include <condition_variable>
+#include <list>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "omnister/lens/lens_file.h"
+#include "omnister/ros/frame_pairing.h"
+#include "omnister/ros/messages.h"
+#include "omnister/ros/parameters.h"
+#include "omnister/stereo/matcher.h"
+
+namespace omnister {
+
+/// Private parameters of the stereo node; lengths in metres.
+struct StereoParameters {
+  bool rig = false;  ///< mode: `stage` (one camera that moves) or `rig` (two cameras)
+  std::string lens;  ///< lens file of the (left) camera; empty: topic lens_model
+  std::string
+      lens_displaced;    ///< rig: lens file of the right camera; empty: topic, or the rig file
+  std::string rig_file;  ///< rig: T_left_right; empty: tf between the images' frames
+  std::string fixed_frame = "stage_base";  ///< stage: camera poses are taken in this tf frame
+  PairingOptions pairing;
+  double max_skew = 0.02;   ///< rig: between the stamps of left and right [s]
+  MatcherOptions matching;  ///< with the mask
+  std::string matcher = "sweep";
+};
+
+/// @throws InputError naming key, value and range, or the mask file
+StereoParameters loadStereoParameters(Parameters& parameters);
+
+/// Subscribes only while somebody listens to `points2`, `depth` or `range`. Matching has its own
+/// thread and takes the newest set; whatever it cannot keep up with is dropped and counted.
+class StereoPipeline {
+ public:
+  /// Returns at once. @throws Error for parameters that do not hold; nothing is then left running.
+  StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandle& private_node);
+  ~StereoPipeline();
+  StereoPipeline(const StereoPipeline&) = delete;
+  StereoPipeline& operator=(const StereoPipeline&) = delete;
+
+ private:
+  struct Eye {
+    std::string topic;  ///< of its images, resolved
+    std::optional<LensFile> lens;
+    std::string lens_text;  ///< of the message it came in
+    ros::Time lens_stamp;
+    bool lens_from_file = false;
+  };
+  struct Job {
+    sensor_msgs::ImageConstPtr reference;
+    std::vector<sensor_msgs::ImageConstPtr> displaced;
+    std::vector<Pose> T_ref_disp;
+  };
+  struct CachedMatcher {
+    StereoGeometry geometry;
+    std::unique_ptr<Matcher> matcher;
+  };
+  using SyncPolicy =
+      message_filters::sync_policies::ApproximateTime<sensor_msgs::Image, sensor_msgs::Image>;
+
+  void onConnection();
+  void subscribe();
+  void unsubscribe();
+  void onLens(const LensModelMessage::ConstPtr& message, std::size_t eye);
+  void onImage(const sensor_msgs::ImageConstPtr& image);
+  void onImages(const sensor_msgs::ImageConstPtr& left, const sensor_msgs::ImageConstPtr& right);
+  void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
+
+  void run();
+  std::optional<Job> nextJob();
+  void process(const Job& job);
+  Matcher& matcherFor(const StereoGeometry& geometry);
+  const cv::Mat& raysOf(const LensFile& file);
+  PoseAnswer cameraPose(const std::string& frame_id, std::int64_t stamp_ns) const;
+  std::optional<Pose> rigPose(const sensor_msgs::Image& left, const sensor_msgs::Image& right,
+                              std::string* reason) const;
+  cv::Size expectedSize(std::size_t eye) const;
+
+  /// Counts a dropped frame or set and remembers why; `fault`: also warns, throttled by name.
+  void drop(const std::string& name, const std::string& reason, bool fault);
+
+  const StereoParameters parameters_;
+  std::optional<Pose> T_left_right_;
+  ros::NodeHandle node_;
+  image_transport::ImageTransport transport_;
+  tf2_ros::Buffer tf_buffer_;
+  std::unique_ptr<tf2_ros::TransformListener> tf_listener_;
+
+  std::mutex connection_mutex_;  ///< subscribers and publishers
+  ros::Publisher points_publisher_;
+  ros::Publisher depth_publisher_;
+  ros::Publisher range_publisher_;
+  image_transport::Subscriber image_subscriber_;
+  std::unique_ptr<image_transport::SubscriberFilter> left_subscriber_;
+  std::unique_ptr<image_transport::SubscriberFilter> right_subscriber_;
+  std::unique_ptr<message_filters::Synchronizer<SyncPolicy>> synchronizer_;
+  std::vector<ros::Subscriber> lens_subscribers_;
+  bool subscribed_ = false;
+
+  mutable std::mutex mutex_;  ///< all below
+  std::condition_variable wake_;
+  bool stopping_ = false;
+  std::vector<Eye> eyes_;
+  FramePairing pairing_;
+  std::optional<Job> rig_job_;
+  std::map<std::string, std::size_t> drops_;
+  std::map<std::string, ros::SteadyTime> warned_;
+  std::string reason_ = "no image yet";
+  std::size_t clouds_ = 0;
+  ros::SteadyTime last_cloud_;  ///< or since when somebody listens
+  MatchStatistics last_statistics_;
+  double last_seconds_ = 0.0;
+
+  std::list<CachedMatcher> matchers_;  ///< most recently used first; worker only
+  LensPtr rays_lens_;                  ///< of rays_; worker only
+  cv::Mat rays_;                       ///< CV_32FC3, unit viewing rays; worker only
+  std::thread worker_;
+
+  diagnostic_updater::Updater diagnostics_;
+  ros::SteadyTimer diagnostics_timer_;
+};
+
+}  // namespace omnister

@@ -1,0 +1,100 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "omnister/ros/stereo_messages.h"
+
+#include <sensor_msgs/image_encodings.h>
+
+#include <boost/make_shared.hpp>
+#include <cstring>
+#include <limits>
+
+namespace omnister {
+namespace {
+
+/// One point of the cloud as it lies in PointCloud2::data.
+struct Point {
+  float x, y, z;
+  std::uint32_t rgb;  ///< 0x00RRGGBB; the field is declared float32, as PCL has it
+  float sigma, score;
+};
+static_assert(sizeof(Point) == 24, "the layout is that of the fields below");
+
+constexpr std::uint8_t kBigEndian =
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+    1;
+#else
+    0;
+#endif
+
+sensor_msgs::ImagePtr floatImage(cv::Size size, const std_msgs::Header& header) {
+  auto message = boost::make_shared<sensor_msgs::Image>();
+  message->header = header;
+  message->width = static_cast<std::uint32_t>(size.width);
+  message->height = static_cast<std::uint32_t>(size.height);
+  message->encoding = sensor_msgs::image_encodings::TYPE_32FC1;
+  message->is_bigendian = kBigEndian;
+  message->step = message->width * sizeof(float);
+  message->data.resize(static_cast<std::size_t>(message->step) * message->height);
+  return message;
+}
+
+}  // namespace
+
+sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Header& header) {
+  auto message = boost::make_shared<sensor_msgs::PointCloud2>();
+  message->header = header;
+  message->width = static_cast<std::uint32_t>(cloud.xyz.cols);
+  message->height = static_cast<std::uint32_t>(cloud.xyz.rows);
+  std::uint32_t offset = 0;
+  for (const char* name : {"x", "y", "z", "rgb", "sigma", "score"}) {
+    sensor_msgs::PointField field;
+    field.name = name;
+    field.offset = offset;
+    field.datatype = sensor_msgs::PointField::FLOAT32;
+    field.count = 1;
+    message->fields.push_back(field);
+    offset += sizeof(float);
+  }
+  message->is_bigendian = kBigEndian;
+  message->is_dense = false;
+  message->point_step = sizeof(Point);
+  message->row_step = message->point_step * message->width;
+  message->data.resize(static_cast<std::size_t>(message->row_step) * message->height);
+  std::uint8_t* out = message->data.data();
+  for (int v = 0; v < cloud.xyz.rows; ++v) {
+    const auto* xyz = cloud.xyz.ptr<cv::Vec3f>(v);
+    const auto* bgr = cloud.bgr.ptr<cv::Vec3b>(v);
+    const auto* sigma = cloud.sigma.ptr<float>(v);
+    const auto* score = cloud.score.ptr<float>(v);
+    for (int u = 0; u < cloud.xyz.cols; ++u, out += sizeof(Point)) {
+      const Point point{xyz[u][0],
+                        xyz[u][1],
+                        xyz[u][2],
+                        static_cast<std::uint32_t>(bgr[u][2]) << 16 |
+                            static_cast<std::uint32_t>(bgr[u][1]) << 8 | bgr[u][0],
+                        sigma[u],
+                        score[u]};
+      std::memcpy(out, &point, sizeof point);
+    }
+  }
+  return message;
+}
+
+sensor_msgs::ImagePtr toDepth(const Cloud& cloud, const std_msgs::Header& header) {
+  const sensor_msgs::ImagePtr message = floatImage(cloud.xyz.size(), header);
+  cv::Mat depth(cloud.xyz.size(), CV_32FC1, message->data.data(), message->step);
+  for (int v = 0; v < depth.rows; ++v) {
+    const auto* xyz = cloud.xyz.ptr<cv::Vec3f>(v);
+    auto* row = depth.ptr<float>(v);
+    for (int u = 0; u < depth.cols; ++u)
+      row[u] = xyz[u][2] > 0.0F ? xyz[u][2] : std::numeric_limits<float>::quiet_NaN();
+  }
+  return message;
+}
+
+sensor_msgs::ImagePtr toRange(const cv::Mat& range, const std_msgs::Header& header) {
+  const sensor_msgs::ImagePtr message = floatImage(range.size(), header);
+  range.copyTo(cv::Mat(range.size(), CV_32FC1, message->data.data(), message->step));
+  return message;
+}
+
+}  // namespace omnister

@@ -1,0 +1,511 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "omnister/ros/stereo_pipeline.h"
+
+#include <sensor_msgs/PointCloud2.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <opencv2/imgcodecs.hpp>
+
+#include "omnister/common/error.h"
+#include "omnister/ros/conversions.h"
+#include "omnister/ros/image_input.h"
+#include "omnister/ros/stereo_messages.h"
+#include "omnister/stereo/cloud.h"
+
+namespace omnister {
+namespace {
+
+/// Geometries whose matcher is kept: a stage that goes to and fro has two.
+constexpr std::size_t kMatchersKept = 4;
+/// Poses nearer than this share of the baseline have the same matcher: far below a pixel.
+constexpr double kSamePlace = 2e-4;
+constexpr double kSameAngle = 1e-4;      // [rad]
+constexpr double kWarningPeriod = 5.0;   // [s]
+constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said why
+
+cv::Mat loadMask(const std::string& path) {
+  if (path.empty()) return {};
+  cv::Mat mask;
+  try {
+    mask = cv::imread(path, cv::IMREAD_GRAYSCALE);
+  } catch (const cv::Exception& error) {
+    throw InputError(path, "", "is no readable image: " + std::string(error.what()));
+  }
+  if (mask.empty())
+    throw InputError(path, "", "is no readable image, expected a mask (0 leaves out)");
+  return mask;
+}
+
+bool sameGeometry(const StereoGeometry& a, const StereoGeometry& b) {
+  if (a.reference_lens != b.reference_lens || a.displaced.size() != b.displaced.size())
+    return false;
+  for (std::size_t i = 0; i < a.displaced.size(); ++i) {
+    const Pose& first = a.displaced[i].T_ref_disp;
+    const Pose& second = b.displaced[i].T_ref_disp;
+    if (a.displaced[i].lens != b.displaced[i].lens) return false;
+    if ((first.translation() - second.translation()).norm() >
+        kSamePlace * second.translation().norm())
+      return false;
+    if (Eigen::AngleAxisd(first.linear().transpose() * second.linear()).angle() > kSameAngle)
+      return false;
+  }
+  return true;
+}
+
+std::int64_t nowNanoseconds() { return static_cast<std::int64_t>(ros::Time::now().toNSec()); }
+
+}  // namespace
+
+StereoParameters loadStereoParameters(Parameters& parameters) {
+  StereoParameters result;
+  result.rig = parameters.choice("mode", "stage", {"stage", "rig"}) == "rig";
+  result.lens = parameters.text("lens", "");
+  result.lens_displaced = parameters.text("lens_displaced", "");
+  result.rig_file = parameters.text("rig", "");
+  result.fixed_frame = parameters.frame("fixed_frame", result.fixed_frame);
+  result.matching.mask = loadMask(parameters.text("mask", ""));
+
+  PairingOptions& pairing = result.pairing;
+  pairing.min_baseline = parameters.number("min_baseline", 0.01, 1e-6, 1e3, "m");
+  pairing.max_baseline = parameters.number("max_baseline", 1.0, 1e-6, 1e3, "m");
+  pairing.max_rotation = parameters.number("max_rotation", 0.5, 0.0, 3.2, "rad");
+  pairing.positions = parameters.integer("positions", 1, 1, 16);
+  pairing.settle_time = parameters.number("settle_time", 0.04, 0.0, 10.0, "s");
+  pairing.settle_distance = parameters.number("settle_distance", 2e-4, 0.0, 1.0, "m");
+  pairing.max_wait = parameters.number("max_wait", 1.0, 0.0, 60.0, "s");
+  pairing.max_age = parameters.number("max_age", 0.0, 0.0, 1e6, "s");
+  pairing.history = static_cast<std::size_t>(pairing.positions) + 7;
+
+  result.max_skew = parameters.number("max_skew", 0.02, 0.0, 1.0, "s");
+  // rviz and others fail on huge coordinates, so a cloud always ends somewhere.
+  result.matching.min_range = parameters.number("min_range", 0.0, 0.0, 1e4, "m");
+  result.matching.max_range = parameters.number("max_range", 50.0, 1e-3, 1e4, "m");
+  result.matching.hypotheses = parameters.integer("hypotheses", 0, 0, 4096);
+  result.matching.threads = parameters.integer("threads", 0, 0, 256);
+  result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
+  if (result.matching.max_range <= result.matching.min_range)
+    throw InputError("~max_range", "", "is not larger than ~min_range");
+  parameters.warnUnknown();
+  return result;
+}
+
+namespace {
+
+StereoParameters load(const ros::NodeHandle& private_node) {
+  Parameters parameters(private_node);
+  return loadStereoParameters(parameters);
+}
+
+}  // namespace
+
+StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandle& private_node)
+    : parameters_(load(private_node)),
+      node_(node),
+      transport_(node_),
+      eyes_(parameters_.rig ? 2 : 1),
+      pairing_(parameters_.pairing),
+      last_cloud_(ros::SteadyTime::now()),
+      diagnostics_(node, private_node) {
+  const std::vector<std::string> prefixes =
+      parameters_.rig ? std::vector<std::string>{"left/", "right/"} : std::vector<std::string>{""};
+  for (std::size_t i = 0; i < eyes_.size(); ++i) {
+    eyes_[i].topic = node_.resolveName(prefixes[i] + "image_raw");
+    const std::string& file = i == 0 ? parameters_.lens : parameters_.lens_displaced;
+    if (!file.empty()) {
+      eyes_[i].lens = readLensFile(file);
+      eyes_[i].lens_from_file = true;
+    }
+  }
+  tf_listener_ = std::make_unique<tf2_ros::TransformListener>(tf_buffer_);
+
+  {
+    std::lock_guard<std::mutex> lock(connection_mutex_);
+    const ros::SubscriberStatusCallback changed = [this](const ros::SingleSubscriberPublisher&) {
+      onConnection();
+    };
+    points_publisher_ = node_.advertise<sensor_msgs::PointCloud2>("points2", 1, changed, changed);
+    depth_publisher_ = node_.advertise<sensor_msgs::Image>("depth", 1, changed, changed);
+    range_publisher_ = node_.advertise<sensor_msgs::Image>("range", 1, changed, changed);
+    for (std::size_t i = 0; i < eyes_.size(); ++i) {
+      if (eyes_[i].lens_from_file) continue;
+      lens_subscribers_.push_back(node_.subscribe<LensModelMessage>(
+          prefixes[i] + "lens_model", 2,
+          [this, i](const LensModelMessage::ConstPtr& message) { onLens(message, i); }));
+    }
+  }
+  diagnostics_.setHardwareID("none");
+  diagnostics_.add("stereo", this, &StereoPipeline::diagnose);
+  // By the steady clock, so that it goes on while a recording pauses.
+  diagnostics_timer_ = node_.createSteadyTimer(
+      ros::WallDuration(1.0),
+      [this](const ros::SteadyTimerEvent&) { diagnostics_.force_update(); });
+  worker_ = std::thread([this] { run(); });
+}
+
+StereoPipeline::~StereoPipeline() {
+  diagnostics_timer_.stop();
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    stopping_ = true;
+  }
+  wake_.notify_all();
+  worker_.join();
+  points_publisher_.shutdown();
+  depth_publisher_.shutdown();
+  range_publisher_.shutdown();
+  for (ros::Subscriber& subscriber : lens_subscribers_) subscriber.shutdown();
+  std::lock_guard<std::mutex> lock(connection_mutex_);
+  unsubscribe();
+}
+
+void StereoPipeline::onConnection() {
+  std::lock_guard<std::mutex> lock(connection_mutex_);
+  const bool wanted = points_publisher_.getNumSubscribers() + depth_publisher_.getNumSubscribers() +
+                          range_publisher_.getNumSubscribers() >
+                      0;
+  try {
+    if (wanted && !subscribed_) subscribe();
+    if (!wanted && subscribed_) unsubscribe();
+  } catch (const std::exception& error) {
+    ROS_ERROR("cannot subscribe to images: %s", printable(error.what()).c_str());
+  }
+}
+
+void StereoPipeline::subscribe() {
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    last_cloud_ = ros::SteadyTime::now();
+    reason_ = "no image on " + eyes_[0].topic;
+  }
+  const image_transport::TransportHints hints("raw", ros::TransportHints().tcpNoDelay());
+  if (parameters_.rig) {
+    left_subscriber_ =
+        std::make_unique<image_transport::SubscriberFilter>(transport_, "left/image_raw", 4, hints);
+    right_subscriber_ = std::make_unique<image_transport::SubscriberFilter>(
+        transport_, "right/image_raw", 4, hints);
+    SyncPolicy policy(8);
+    policy.setMaxIntervalDuration(ros::Duration(parameters_.max_skew));
+    policy.setReset(true);
+    synchronizer_ = std::make_unique<message_filters::Synchronizer<SyncPolicy>>(
+        static_cast<const SyncPolicy&>(policy), *left_subscriber_, *right_subscriber_);
+    synchronizer_->registerCallback(boost::bind(&StereoPipeline::onImages, this,
+                                                boost::placeholders::_1, boost::placeholders::_2));
+  } else {
+    image_subscriber_ = transport_.subscribe(
+        "image_raw", 4, [this](const sensor_msgs::ImageConstPtr& image) { onImage(image); },
+        ros::VoidPtr(), hints);
+  }
+  subscribed_ = true;
+}
+
+void StereoPipeline::unsubscribe() {
+  image_subscriber_.shutdown();
+  synchronizer_.reset();
+  left_subscriber_.reset();
+  right_subscriber_.reset();
+  subscribed_ = false;
+  std::lock_guard<std::mutex> lock(mutex_);
+  pairing_.reset("nobody listens");
+  rig_job_.reset();
+}
+
+void StereoPipeline::drop(const std::string& name, const std::string& reason, bool fault) {
+  bool say = false;
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    ++drops_[name];
+    reason_ = reason;
+    if (fault) {
+      const ros::SteadyTime now = ros::SteadyTime::now();
+      const auto last = warned_.find(name);
+      say = last == warned_.end() || (now - last->second).toSec() >= kWarningPeriod;
+      if (say) warned_[name] = now;
+    }
+  }
+  if (say) ROS_WARN("%s", printable(reason, 500).c_str());
+}
+
+void StereoPipeline::onLens(const LensModelMessage::ConstPtr& message, std::size_t eye) {
+  const std::string topic = node_.resolveName(!parameters_.rig ? "lens_model"
+                                              : eye == 0       ? "left/lens_model"
+                                                               : "right/lens_model");
+  try {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      // Latched lenses of camera and calibration arrive in any order: the later one is right.
+      Eye& known = eyes_[eye];
+      if (known.lens && message->header.stamp < known.lens_stamp) return;
+      if (known.lens && message->yaml == known.lens_text) {
+        known.lens_stamp = message->header.stamp;
+        return;
+      }
+    }
+    LensFile file = fromLensModelMessage(*message, topic);
+    const std::string model(file.lens->model());
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      eyes_[eye].lens = std::move(file);
+      eyes_[eye].lens_text = message->yaml;
+      eyes_[eye].lens_stamp = message->header.stamp;
+    }
+    ROS_INFO("new lens on %s: %s, %ux%u", topic.c_str(), model.c_str(), message->width,
+             message->height);
+  } catch (const std::exception& error) {
+    drop("bad lens", error.what(), true);
+  }
+}
+
+cv::Size StereoPipeline::expectedSize(std::size_t eye) const {
+  std::lock_guard<std::mutex> lock(mutex_);
+  return eyes_[eye].lens ? eyes_[eye].lens->image_size : cv::Size();
+}
+
+void StereoPipeline::onImage(const sensor_msgs::ImageConstPtr& image) {
+  try {
+    checkFrame(*image, expectedSize(0), eyes_[0].topic);
+  } catch (const std::exception& error) {
+    return drop("bad image", error.what(), true);
+  }
+  PairingFrame frame;
+  frame.stamp_ns = static_cast<std::int64_t>(image->header.stamp.toNSec());
+  frame.frame_id = image->header.frame_id;
+  frame.image = std::shared_ptr<const void>(image.get(), [image](const void*) {});
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    pairing_.add(std::move(frame), nowNanoseconds());
+  }
+  wake_.notify_all();
+}
+
+void StereoPipeline::onImages(const sensor_msgs::ImageConstPtr& left,
+                              const sensor_msgs::ImageConstPtr& right) {
+  Job job;
+  try {
+    checkFrame(*left, expectedSize(0), eyes_[0].topic);
+    checkFrame(*right, expectedSize(1), eyes_[1].topic);
+  } catch (const std::exception& error) {
+    return drop("bad image", error.what(), true);
+  }
+  std::string why;
+  const std::optional<Pose> T_left_right = rigPose(*left, *right, &why);
+  if (!T_left_right) return drop("no pose", "no pose between the cameras: " + why, true);
+  job.reference = left;
+  job.displaced = {right};
+  job.T_ref_disp = {*T_left_right};
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (rig_job_) ++drops_["busy"];
+    rig_job_ = std::move(job);
+  }
+  wake_.notify_all();
+}
+
+std::optional<Pose> StereoPipeline::rigPose(const sensor_msgs::Image& left,
+                                            const sensor_msgs::Image& right,
+                                            std::string* reason) const {
+  if (T_left_right_) return T_left_right_;
+  try {
+    // The cameras are joined rigidly, so the latest pose between them will do.
+    return fromTransform(
+        tf_buffer_.lookupTransform(left.header.frame_id, right.header.frame_id, ros::Time(0))
+            .transform,
+        "tf");
+  } catch (const std::exception& error) {
+    *reason = error.what();
+    return std::nullopt;
+  }
+}
+
+PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t stamp_ns) const {
+  PoseAnswer answer;
+  // tf2 takes time 0 for "the latest".
+  if (stamp_ns <= 0) {
+    answer.reason = "the stamp is before all tf";
+    return answer;
+  }
+  ros::Time stamp;
+  try {
+    stamp.fromNSec(static_cast<std::uint64_t>(stamp_ns));
+    answer.T_fixed_camera = fromTransform(
+        tf_buffer_.lookupTransform(parameters_.fixed_frame, frame_id, stamp).transform, "tf");
+    answer.state = PoseAnswer::State::kKnown;
+  } catch (const tf2::ExtrapolationException& error) {
+    answer.reason = printable(error.what(), 300);
+    const bool past = answer.reason.find("into the past") != std::string::npos;
+    answer.state = past ? PoseAnswer::State::kNever : PoseAnswer::State::kLater;
+  } catch (const tf2::TransformException& error) {
+    // A frame that nobody has published yet may still come.
+    answer.reason = printable(error.what(), 300);
+    answer.state = PoseAnswer::State::kLater;
+  } catch (const std::exception& error) {
+    answer.reason = error.what();
+  }
+  return answer;
+}
+
+std::optional<StereoPipeline::Job> StereoPipeline::nextJob() {
+  std::unique_lock<std::mutex> lock(mutex_);
+  if (!stopping_ && !rig_job_)
+    wake_.wait_for(lock, std::chrono::milliseconds(pairing_.waiting() ? 10 : 200));
+  if (stopping_) return std::nullopt;
+  if (parameters_.rig) {
+    std::optional<Job> job = std::move(rig_job_);
+    rig_job_.reset();
+    return job;
+  }
+  const std::optional<FrameSet> set =
+      pairing_.poll([this](const std::string& frame_id,
+                           std::int64_t stamp) { return cameraPose(frame_id, stamp); },
+                    nowNanoseconds());
+  if (!pairing_.reason().empty()) reason_ = pairing_.reason();
+  if (!set) return std::nullopt;
+  const auto message = [](const PairingFrame& frame) {
+    const std::shared_ptr<const void> held = frame.image;
+    return sensor_msgs::ImageConstPtr(static_cast<const sensor_msgs::Image*>(held.get()),
+                                      [held](const sensor_msgs::Image*) {});
+  };
+  Job job;
+  job.reference = message(set->reference);
+  for (const FrameSet::Displaced& displaced : set->displaced) {
+    job.displaced.push_back(message(displaced.frame));
+    job.T_ref_disp.push_back(displaced.T_ref_disp);
+  }
+  return job;
+}
+
+void StereoPipeline::run() {
+  for (;;) {
+    std::optional<Job> job;
+    try {
+      job = nextJob();
+      if (job) process(*job);
+    } catch (const std::exception& error) {
+      drop("failed", error.what(), true);
+    }
+    double silence = 0.0;
+    std::string why;
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      if (stopping_) return;
+      silence = (ros::SteadyTime::now() - last_cloud_).toSec();
+      const auto said = warned_.find("silence");
+      if (said != warned_.end())
+        silence = std::min(silence, (ros::SteadyTime::now() - said->second).toSec());
+      if (silence >= kSilencePeriod) warned_["silence"] = ros::SteadyTime::now();
+      why = reason_;
+    }
+    if (silence < kSilencePeriod) continue;
+    std::lock_guard<std::mutex> lock(connection_mutex_);
+    if (subscribed_) ROS_INFO("no cloud for %.0f s: %s", silence, printable(why, 500).c_str());
+  }
+}
+
+Matcher& StereoPipeline::matcherFor(const StereoGeometry& geometry) {
+  const auto known = std::find_if(
+      matchers_.begin(), matchers_.end(),
+      [&](const CachedMatcher& kept) { return sameGeometry(kept.geometry, geometry); });
+  if (known != matchers_.end()) {
+    matchers_.splice(matchers_.begin(), matchers_, known);
+  } else {
+    matchers_.push_front(
+        {geometry, makeMatcher(parameters_.matcher, geometry, parameters_.matching)});
+    if (matchers_.size() > kMatchersKept) matchers_.pop_back();
+  }
+  return *matchers_.front().matcher;
+}
+
+const cv::Mat& StereoPipeline::raysOf(const LensFile& file) {
+  if (rays_lens_ != file.lens) {
+    rays_ = viewingRays(*file.lens, file.image_size, parameters_.matching.threads);
+    rays_lens_ = file.lens;
+  }
+  return rays_;
+}
+
+void StereoPipeline::process(const Job& job) {
+  const ros::SteadyTime start = ros::SteadyTime::now();
+  std::vector<LensFile> lenses;
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    for (const Eye& eye : eyes_)
+      if (eye.lens) lenses.push_back(*eye.lens);
+  }
+  if (lenses.size() != eyes_.size())
+    return drop("no lens", "no lens yet: nothing on lens_model, and no parameter ~lens", false);
+  // A lens may have come after the images.
+  const LensFile& reference_lens = lenses.front();
+  const LensFile& displaced_lens = lenses.back();
+  checkFrame(*job.reference, reference_lens.image_size, eyes_.front().topic);
+  for (const auto& image : job.displaced)
+    checkFrame(*image, displaced_lens.image_size, eyes_.back().topic);
+  const cv::Mat& mask = parameters_.matching.mask;
+  if (!mask.empty() && mask.size() != reference_lens.image_size)
+    throw InputError("~mask", "size", "is not that of the lens' image");
+
+  StereoGeometry geometry;
+  geometry.reference_lens = reference_lens.lens;
+  geometry.reference_size = reference_lens.image_size;
+  for (const Pose& pose : job.T_ref_disp)
+    geometry.displaced.push_back({displaced_lens.lens, displaced_lens.image_size, pose});
+
+  int bits = significantBits(*job.reference);
+  for (const auto& image : job.displaced) bits = std::max(bits, significantBits(*image));
+  const cv::Mat reference = toGray(*job.reference, bits);
+  std::vector<cv::Mat> displaced;
+  for (const auto& image : job.displaced) displaced.push_back(toGray(*image, bits));
+
+  const MatchResult result = matcherFor(geometry).match(reference, displaced);
+
+  const std_msgs::Header& header = job.reference->header;
+  const bool points_wanted = points_publisher_.getNumSubscribers() > 0;
+  if (points_wanted || depth_publisher_.getNumSubscribers() > 0) {
+    const Cloud cloud = makeCloud(result, raysOf(reference_lens),
+                                  points_wanted ? toBgr(*job.reference, bits) : reference,
+                                  parameters_.matching.threads);
+    if (points_wanted) points_publisher_.publish(toPointCloud(cloud, header));
+    if (depth_publisher_.getNumSubscribers() > 0) depth_publisher_.publish(toDepth(cloud, header));
+  }
+  if (range_publisher_.getNumSubscribers() > 0)
+    range_publisher_.publish(toRange(result.range, header));
+
+  std::lock_guard<std::mutex> lock(mutex_);
+  ++clouds_;
+  last_cloud_ = ros::SteadyTime::now();
+  last_statistics_ = result.statistics;
+  last_seconds_ = (last_cloud_ - start).toSec();
+  reason_.clear();
+}
+
+void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
+  bool subscribed = false;
+  {
+    std::lock_guard<std::mutex> lock(connection_mutex_);
+    subscribed = subscribed_;
+  }
+  std::lock_guard<std::mutex> lock(mutex_);
+  const double silence = (ros::SteadyTime::now() - last_cloud_).toSec();
+  using diagnostic_msgs::DiagnosticStatus;
+  if (!subscribed)
+    status.summary(DiagnosticStatus::OK, "idle: nobody listens");
+  else if (silence < kWarningPeriod)
+    status.summary(DiagnosticStatus::OK, "running");
+  else
+    status.summary(DiagnosticStatus::WARN, "no cloud: " + printable(reason_, 300));
+  for (const Eye& eye : eyes_)
+    status.add("lens of " + eye.topic, eye.lens ? std::string(eye.lens->lens->model()) : "none");
+  status.add("clouds", clouds_);
+  if (clouds_ > 0) {
+    status.add("valid pixels", last_statistics_.valid);
+    status.add("seconds, whole frame", last_seconds_);
+    for (const auto& [stage, seconds] : last_statistics_.seconds)
+      status.add("seconds, " + stage, seconds);
+    for (const auto& [test, pixels] : last_statistics_.rejected)
+      status.add("pixels rejected, " + test, pixels);
+  }
+  for (const auto& [name, count] : pairing_.counts()) status.add("frames, " + name, count);
+  for (const auto& [name, count] : drops_) status.add("dropped, " + name, count);
+}
+
+}  // namespace omnister

@@ -1,0 +1,161 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "omnister/ros/view_collector.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <limits>
+#include <map>
+#include <opencv2/imgproc.hpp>
+
+#include "omnister/common/error.h"
+
+namespace omnister {
+namespace {
+
+/// Mean distance between corners that both views hold [px]; infinite when they share less than half
+/// of the smaller one.
+double meanMove(const ViewDetections& a, const ViewDetections& b) {
+  std::map<std::pair<double, double>, Eigen::Vector2d> known;
+  for (std::size_t i = 0; i < a.points.size(); ++i)
+    known[{a.points[i].x(), a.points[i].y()}] = a.pixels[i];
+  double sum = 0.0;
+  std::size_t shared = 0;
+  for (std::size_t i = 0; i < b.points.size(); ++i) {
+    const auto found = known.find({b.points[i].x(), b.points[i].y()});
+    if (found == known.end()) continue;
+    sum += (found->second - b.pixels[i]).norm();
+    ++shared;
+  }
+  if (shared == 0 || 2 * shared < std::min(a.points.size(), b.points.size()))
+    return std::numeric_limits<double>::infinity();
+  return sum / static_cast<double>(shared);
+}
+
+}  // namespace
+
+ViewCollector::ViewCollector(cv::Size image_size, const CollectorOptions& options)
+    : options_(options), cells_(image_size, CV_32SC1) {
+  if (image_size.width < 2 || image_size.height < 2)
+    throw Error("an image of less than 2x2 pixels");
+  detections_.image_size = image_size;
+  const auto cells = static_cast<std::size_t>(options_.rings * options_.sectors);
+  brightness_.assign(cells, 0.0);
+  corners_.assign(cells, 0);
+  for (int v = 0; v < image_size.height; ++v)
+    for (int u = 0; u < image_size.width; ++u) cells_.at<int>(v, u) = cellOf(u, v);
+}
+
+int ViewCollector::cellOf(double u, double v) const {
+  const double x = u - 0.5 * (cells_.cols - 1);
+  const double y = v - 0.5 * (cells_.rows - 1);
+  const double radius = std::hypot(x, y) / (0.5 * std::hypot(cells_.cols, cells_.rows));
+  const double turn = std::atan2(y, x) / (2.0 * CV_PI) + 1.0;
+  const int ring = std::clamp(static_cast<int>(radius * options_.rings), 0, options_.rings - 1);
+  // The first sector is centred on the right-hand direction.
+  const int sector = static_cast<int>(std::floor(turn * options_.sectors + 0.5)) % options_.sectors;
+  return ring * options_.sectors + sector;
+}
+
+ViewCollector::Verdict ViewCollector::add(const cv::Mat& gray,
+                                          const std::optional<ViewDetections>& found) {
+  if (gray.size() != cells_.size() || gray.type() != CV_8UC1)
+    throw Error("images changed their size while views were collected");
+  ++images_;
+  last_image_ = gray;
+  std::vector<double> sum(brightness_.size(), 0.0);
+  std::vector<double> count(brightness_.size(), 0.0);
+  for (int v = 0; v < gray.rows; v += 4) {
+    const auto* row = gray.ptr<std::uint8_t>(v);
+    const auto* cell = cells_.ptr<int>(v);
+    for (int u = 0; u < gray.cols; u += 4) {
+      sum[static_cast<std::size_t>(cell[u])] += row[u];
+      count[static_cast<std::size_t>(cell[u])] += 1.0;
+    }
+  }
+  for (std::size_t i = 0; i < sum.size(); ++i)
+    if (count[i] > 0.0) brightness_[i] = std::max(brightness_[i], sum[i] / count[i]);
+
+  const std::optional<ViewDetections> before = std::exchange(previous_, found);
+  if (!found) return Verdict::kNotFound;
+  if (!before || !(meanMove(*before, *found) <= options_.still_px)) return Verdict::kMoving;
+  const double least = options_.min_move * std::hypot(cells_.cols, cells_.rows);
+  for (const ViewDetections& view : detections_.views)
+    if (meanMove(view, *found) < least) return Verdict::kAlike;
+  ViewDetections view = *found;
+  char name[24];
+  std::snprintf(name, sizeof name, "view_%03zu", detections_.views.size());
+  view.name = name;
+  for (const Eigen::Vector2d& pixel : view.pixels)
+    ++corners_[static_cast<std::size_t>(cellOf(pixel.x(), pixel.y()))];
+  detections_.views.push_back(std::move(view));
+  return Verdict::kTaken;
+}
+
+double ViewCollector::coverage() const {
+  int inside = 0;
+  int covered = 0;
+  for (std::size_t i = 0; i < corners_.size(); ++i) {
+    if (!bright(static_cast<int>(i)) && corners_[i] == 0) continue;
+    ++inside;
+    covered += corners_[i] > 0 ? 1 : 0;
+  }
+  return inside == 0 ? 0.0 : static_cast<double>(covered) / inside;
+}
+
+std::string ViewCollector::hint() const {
+  // The emptiest cell, inner rings first: outwards it gets harder to hold the target still.
+  int best = -1;
+  for (int cell = 0; cell < static_cast<int>(corners_.size()); ++cell) {
+    if (!bright(cell)) continue;
+    if (best < 0 ||
+        corners_[static_cast<std::size_t>(cell)] < corners_[static_cast<std::size_t>(best)])
+      best = cell;
+  }
+  if (best < 0) return "the image is black";
+  const int ring = best / options_.sectors;
+  const double turn = 2.0 * CV_PI * (best % options_.sectors) / options_.sectors;
+  const double x = std::cos(turn);
+  const double y = std::sin(turn);
+  std::string place = y > 0.4 ? "lower" : y < -0.4 ? "upper" : "";
+  if (std::abs(x) > 0.4)
+    place += std::string(place.empty() ? "" : " ") + (x > 0.0 ? "right" : "left");
+  if (ring == 0) return place + ", near the middle, tilted";
+  if (ring == options_.rings - 1) return place + ", at the edge";
+  return place + ", half way out";
+}
+
+cv::Mat ViewCollector::draw() const {
+  if (last_image_.empty()) return cv::Mat(cells_.size(), CV_8UC3, cv::Scalar::all(0));
+  cv::Mat picture;
+  cv::cvtColor(last_image_, picture, cv::COLOR_GRAY2BGR);
+  for (int v = 0; v < picture.rows; ++v) {
+    auto* row = picture.ptr<cv::Vec3b>(v);
+    const auto* cell = cells_.ptr<int>(v);
+    for (int u = 0; u < picture.cols; ++u) {
+      const int n = corners_[static_cast<std::size_t>(cell[u])];
+      const bool edge =
+          (u > 0 && cell[u - 1] != cell[u]) || (v > 0 && cells_.at<int>(v - 1, u) != cell[u]);
+      cv::Vec3b tint(0, 0, 0);
+      if (n > 0)
+        tint = cv::Vec3b(0, static_cast<std::uint8_t>(std::min(40 + 4 * n, 110)), 0);
+      else if (bright(cell[u]))
+        tint = cv::Vec3b(0, 0, 60);
+      for (int k = 0; k < 3; ++k)
+        row[u][k] = cv::saturate_cast<std::uint8_t>((edge ? 40 : 0) + 0.6 * row[u][k] + tint[k]);
+    }
+  }
+  const auto at = [](const Eigen::Vector2d& pixel) {
+    return cv::Point(static_cast<int>(std::lround(pixel.x())),
+                     static_cast<int>(std::lround(pixel.y())));
+  };
+  for (const ViewDetections& view : detections_.views)
+    for (const Eigen::Vector2d& pixel : view.pixels)
+      cv::circle(picture, at(pixel), 1, cv::Scalar(60, 220, 60), -1);
+  if (previous_)
+    for (const Eigen::Vector2d& pixel : previous_->pixels)
+      cv::circle(picture, at(pixel), 4, cv::Scalar(0, 220, 255), 1, cv::LINE_AA);
+  return picture;
+}
+
+}  // namespace omnister
