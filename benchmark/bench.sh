@@ -1,0 +1,69 @@
+#!/usr/bin/env bash
+# The benchmarks; called by `./run bench`.
+set -euo pipefail
+
+usage() {
+  cat <<'TXT'
+./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling [OPTION…]]
+
+  parts      Google Benchmark: lenses, renderer, views, the sweep
+  compare    the sweep beside OpenCV's matchers on the same rendered pair, at 1280x960 and 3060x2036,
+             one thread and all: times as ratios, memory, density, errors
+  accuracy   errors of the sweep by field angle on further scenes; phase bias; more than two positions
+  scaling    cost by pixels, hypotheses, positions and threads, with a plot
+
+Without a name: all of them. Options after a name go to it (`./run bench compare --help`). --quick: fewer
+runs and the small size only. Results go to DIR too (JSON, CSV, SVG). OMNISTER_SIMD=avx2 or scalar holds
+the sweep to narrower registers.
+TXT
+}
+
+out=
+quick=
+while [ $# -gt 0 ]; do
+  case "$1" in
+    --quick) quick=yes ;;
+    --out) out=${2:?--out needs a folder}; shift ;;
+    -h | --help) usage; exit 0 ;;
+    *) break ;;
+  esac
+  shift
+done
+if [ -n "$out" ]; then
+  mkdir -p "$out"
+  out=$(cd "$out" && pwd)
+fi
+part=${1:-all}
+[ $# -gt 0 ] && shift
+
+parts() {
+  omnister_bench_core --benchmark_min_time="$([ -n "$quick" ] && echo 0.05 || echo 0.3)" \
+    ${out:+--benchmark_out="$out/parts.json"} "$@"
+}
+stereo() { omnister_bench_stereo ${out:+--out "$out"} "$@"; }
+compare() {
+  if [ -n "$quick" ]; then
+    stereo --suite compare --runs 3 "$@"
+  elif [[ " $* " == *" --size "* ]]; then
+    stereo --suite compare "$@"
+  else
+    stereo --suite compare --size 1280x960 3060x2036 --thesis-rows 240 "$@"
+  fi
+}
+
+case "$part" in
+  all)
+    parts
+    compare
+    stereo --suite accuracy
+    stereo --suite scaling --runs "$([ -n "$quick" ] && echo 3 || echo 5)"
+    ;;
+  parts) parts "$@" ;;
+  compare) compare "$@" ;;
+  accuracy) stereo --suite accuracy "$@" ;;
+  scaling) stereo --suite scaling "$@" ;;
+  *)
+    usage >&2
+    exit 2
+    ;;
+esac
