@@ -29,37 +29,38 @@ constexpr double kMaxCenter = 1e7;  // [px]
 constexpr double kCosSlack = 1e-12;
 constexpr double kFieldSlack = 1e-8;  // [rad]
 
-// Brown's tangential terms on m = (n_x, n_y) / (1 + n_z).
+// With m = tan(theta / 2) e and a = theta e, e being the azimuth, decentring turns the angle vector
+// a into a + (1 + |m|^2) T(m), T being Brown's tangential terms and 1 + |m|^2 = 2 |dm/da|. Radii of
+// wide lenses are about proportional to theta, so that this is a shift on the sensor that gathers
+// at the rim: measured on real lenses past 90 degrees, T(m) alone leaves a tenth more error.
 struct Decentring {
   Eigen::Vector2d d = Eigen::Vector2d::Zero();
 
-  Eigen::Vector2d shift(const Eigen::Vector2d& m) const {
-    const double mm = m.squaredNorm();
-    const double md = 2.0 * m.dot(d.reverse());
-    // (2 d1 x y + d2 (r^2 + 2 x^2), d1 (r^2 + 2 y^2) + 2 d2 x y)
-    return Eigen::Vector2d(d[1] * mm, d[0] * mm) + m * md;
+  // (2 d1 x y + d2 (r^2 + 2 x^2), d1 (r^2 + 2 y^2) + 2 d2 x y)
+  Eigen::Vector2d brown(const Eigen::Vector2d& m) const {
+    return m.squaredNorm() * d.reverse() + 2.0 * m.dot(d.reverse()) * m;
   }
+  Eigen::Vector2d shift(const Eigen::Vector2d& m) const {
+    return (1.0 + m.squaredNorm()) * brown(m);
+  }
+  // d(shift)/dm
   Eigen::Matrix2d jacobian(const Eigen::Vector2d& m) const {
     const Eigen::Vector2d e = d.reverse();
-    Eigen::Matrix2d out = 2.0 * (e * m.transpose() + m * e.transpose());
-    out.diagonal().array() += 1.0 + 2.0 * m.dot(e);
-    return out;
+    Eigen::Matrix2d d_brown = 2.0 * (e * m.transpose() + m * e.transpose());
+    d_brown.diagonal().array() += 2.0 * m.dot(e);
+    return (1.0 + m.squaredNorm()) * d_brown + 2.0 * brown(m) * m.transpose();
   }
   static Eigen::Matrix2d byParameters(const Eigen::Vector2d& m) {
     const double mm = m.squaredNorm();
     const double xy = 2.0 * m.x() * m.y();
     Eigen::Matrix2d out;
     out << xy, mm + 2.0 * m.x() * m.x(), mm + 2.0 * m.y() * m.y(), xy;
-    return out;
+    return (1.0 + mm) * out;
   }
 };
 
+// m of a unit direction.
 Eigen::Vector2d toPlane(const Eigen::Vector3d& n) { return n.head<2>() / (1.0 + n.z()); }
-
-Eigen::Vector3d fromPlane(const Eigen::Vector2d& m) {
-  const double mm = m.squaredNorm();
-  return Eigen::Vector3d(2.0 * m.x(), 2.0 * m.y(), 1.0 - mm) / (1.0 + mm);
-}
 
 Jacobian23 toPlaneJacobian(const Eigen::Vector3d& n) {
   const double k = 1.0 / (1.0 + n.z());
@@ -68,12 +69,51 @@ Jacobian23 toPlaneJacobian(const Eigen::Vector3d& n) {
   return out;
 }
 
-Jacobian32 fromPlaneJacobian(const Eigen::Vector2d& m) {
-  const double k = 1.0 / (1.0 + m.squaredNorm());
-  Jacobian32 out;
-  out.topRows<2>() = 2.0 * k * (Eigen::Matrix2d::Identity() - 2.0 * k * m * m.transpose());
-  out.row(2) = -4.0 * k * k * m.transpose();
+// The angle vector a of a unit direction, and back.
+Eigen::Vector2d toAngles(const Eigen::Vector3d& n) {
+  const double s = n.head<2>().norm();
+  return (s > 1e-9 ? std::atan2(s, n.z()) / s : 1.0) * n.head<2>();
+}
+
+Jacobian23 toAnglesJacobian(const Eigen::Vector3d& n) {
+  const double s = n.head<2>().norm();
+  const Eigen::Vector2d e = s > 0.0 ? Eigen::Vector2d(n.head<2>() / s) : Eigen::Vector2d(1.0, 0.0);
+  const Eigen::Vector2d t(-e.y(), e.x());
+  const double k = s > 1e-9 ? std::atan2(s, n.z()) / s : 1.0;
+  Jacobian23 out;
+  out << n.z() * e * e.transpose() + k * t * t.transpose(), -s * e;
   return out;
+}
+
+Eigen::Vector3d fromAngles(const Eigen::Vector2d& a) {
+  const double theta = a.norm();
+  const double k = theta > 1e-9 ? std::sin(theta) / theta : 1.0;
+  return Eigen::Vector3d(k * a.x(), k * a.y(), std::cos(theta));
+}
+
+Jacobian32 fromAnglesJacobian(const Eigen::Vector2d& a) {
+  const double theta = a.norm();
+  const Eigen::Vector2d e = theta > 0.0 ? Eigen::Vector2d(a / theta) : Eigen::Vector2d(1.0, 0.0);
+  const Eigen::Vector2d t(-e.y(), e.x());
+  const double k = theta > 1e-9 ? std::sin(theta) / theta : 1.0;
+  Jacobian32 out;
+  out << std::cos(theta) * e * e.transpose() + k * t * t.transpose(),
+      -std::sin(theta) * e.transpose();
+  return out;
+}
+
+// m of an angle vector, and dm/da.
+Eigen::Vector2d planeOfAngles(const Eigen::Vector2d& a) {
+  const double theta = a.norm();
+  return (theta > 1e-9 ? std::tan(0.5 * theta) / theta : 0.5) * a;
+}
+
+Eigen::Matrix2d planeOfAnglesJacobian(const Eigen::Vector2d& a) {
+  const double theta = a.norm();
+  const Eigen::Vector2d e = theta > 0.0 ? Eigen::Vector2d(a / theta) : Eigen::Vector2d(1.0, 0.0);
+  const double m = std::tan(0.5 * theta);
+  const double k = theta > 1e-9 ? m / theta : 0.5;
+  return k * Eigen::Matrix2d::Identity() + (0.5 * (1.0 + m * m) - k) * e * e.transpose();
 }
 
 struct Extras {
@@ -117,19 +157,19 @@ class CentralLens final : public LensModel {
       }
     } else {
       const Eigen::Vector2d m = toPlane(n);
-      const Eigen::Vector2d m_bent = m + decentring_.shift(m);
+      const Eigen::Vector2d a_bent = toAngles(n) + decentring_.shift(m);
       const bool need_d_n = d_bearing != nullptr || d_parameters != nullptr;
-      if (!surface_.project(fromPlane(m_bent), xy, need_d_n ? &d_n : nullptr, d_p)) {
+      if (!surface_.project(fromAngles(a_bent), xy, need_d_n ? &d_n : nullptr, d_p)) {
         return std::nullopt;
       }
       if (need_d_n) {
-        const Eigen::Matrix2d d_m = d_n * fromPlaneJacobian(m_bent);
+        const Eigen::Matrix2d d_a = d_n * fromAnglesJacobian(a_bent);
         if (d_parameters != nullptr) {
           d_parameters->resize(2, size());
-          d_parameters->template rightCols<2>() = linear_ * d_m * Decentring::byParameters(m);
+          d_parameters->template rightCols<2>() = linear_ * d_a * Decentring::byParameters(m);
         }
         if (d_bearing != nullptr) {
-          d_n = d_m * decentring_.jacobian(m) * toPlaneJacobian(n);
+          d_n = d_a * (toAnglesJacobian(n) + decentring_.jacobian(m) * toPlaneJacobian(n));
           d_n -= (d_n * n) * n.transpose();
         }
       }
@@ -156,14 +196,12 @@ class CentralLens final : public LensModel {
     if (!surface_.unproject(xy, n, d_pixel != nullptr ? &d_xy : nullptr)) return std::nullopt;
     if (extras_.decentring) {
       if (!(1.0 + n.z() > 1e-12)) return std::nullopt;
-      const Eigen::Vector2d m_bent = toPlane(n);
-      const auto m = straighten(m_bent);
-      if (!m) return std::nullopt;
+      const auto a = straighten(toAngles(n));
+      if (!a) return std::nullopt;
       if (d_pixel != nullptr) {
-        d_xy =
-            fromPlaneJacobian(*m) * decentring_.jacobian(*m).inverse() * toPlaneJacobian(n) * d_xy;
+        d_xy = fromAnglesJacobian(*a) * bentJacobian(*a).inverse() * toAnglesJacobian(n) * d_xy;
       }
-      n = fromPlane(*m);
+      n = fromAngles(*a);
     }
     if (!(n.z() >= cos_max_)) return std::nullopt;
     if (d_pixel != nullptr) *d_pixel = d_xy * inverse_linear_;
@@ -223,12 +261,14 @@ class CentralLens final : public LensModel {
     double bent_field = field;
     if (extras_.decentring) {
       out->decentring_.d = parameters.tail<2>();
-      // The Jacobian of the shift is symmetric with eigenvalues of at least 1 - 6 |d| |m|: while
-      // that is positive over the disc of the field, the shift is one-to-one there.
-      out->plane_radius_ = std::tan(0.5 * field);
-      const double bend = out->decentring_.d.norm() * out->plane_radius_;
-      if (!(6.0 * bend < 0.95)) return nullptr;
-      bent_field = 2.0 * std::atan(out->plane_radius_ * (1.0 + 3.0 * bend));
+      // With |T| <= 3 |d| |m|^2, |dT/dm| <= 6 |d| |m| and |dm/da| <= (1 + |m|^2) / 2 the shift
+      // changes by at most 3 |d| |m| (1 + 2 |m|^2) (1 + |m|^2) per radian: below one over the disc
+      // of the field, it is one-to-one there.
+      const double radius = std::tan(0.5 * field);
+      const double square = radius * radius;
+      const double bend = 3.0 * out->decentring_.d.norm() * radius * (1.0 + square);
+      if (!(bend * (1.0 + 2.0 * square) < 0.95)) return nullptr;
+      bent_field = std::min(field + bend * radius, kLargestField);
     }
     const auto surface = surface_.with(parameters.data() + 2, bent_field + kFieldSlack);
     if (!surface) return nullptr;
@@ -243,31 +283,41 @@ class CentralLens final : public LensModel {
 
   int size() const { return 2 + surface_.size() + extras_.size(); }
 
-  // The inverse of m + shift(m), by Newton with halved steps: within the field the solution is the
+  // d(a + T)/da
+  Eigen::Matrix2d bentJacobian(const Eigen::Vector2d& a) const {
+    return Eigen::Matrix2d::Identity() +
+           decentring_.jacobian(planeOfAngles(a)) * planeOfAnglesJacobian(a);
+  }
+
+  // The inverse of a + T(m(a)), by Newton with halved steps: within the field the solution is the
   // only one, and outside none is wanted.
   std::optional<Eigen::Vector2d> straighten(const Eigen::Vector2d& bent) const {
-    const double border = plane_radius_ * (1.0 + 1e-9);
-    const auto inside = [&](const Eigen::Vector2d& m) -> Eigen::Vector2d {
-      const double length = m.norm();
-      return length <= border ? m : Eigen::Vector2d(m * (border / length));
+    const double border = max_theta_ * (1.0 + 1e-9);
+    const auto inside = [&](const Eigen::Vector2d& a) -> Eigen::Vector2d {
+      const double length = a.norm();
+      return length <= border ? a : Eigen::Vector2d(a * (border / length));
     };
-    Eigen::Vector2d m = inside(bent - decentring_.shift(bent));
-    Eigen::Vector2d error = m + decentring_.shift(m) - bent;
+    const auto errorOf = [&](const Eigen::Vector2d& a) -> Eigen::Vector2d {
+      return a + decentring_.shift(planeOfAngles(a)) - bent;
+    };
+    Eigen::Vector2d a = inside(bent);
+    a = inside(bent - decentring_.shift(planeOfAngles(a)));
+    Eigen::Vector2d error = errorOf(a);
     for (int i = 0; i < 50; ++i) {
       const double size = error.norm();
-      if (size <= 1e-16 * (1.0 + bent.norm())) return m;
-      const Eigen::Vector2d step = decentring_.jacobian(m).inverse() * error;
+      if (size <= 1e-16 * (1.0 + bent.norm())) return a;
+      const Eigen::Vector2d step = bentJacobian(a).inverse() * error;
       double part = 1.0;
       for (;; part *= 0.5) {
         if (part < 1e-3) {
           // No further descent: converged to rounding, or stuck at the border of the field.
-          if (size <= 1e-13 * (1.0 + bent.norm())) return m;
+          if (size <= 1e-13 * (1.0 + bent.norm())) return a;
           return std::nullopt;
         }
-        const Eigen::Vector2d next = inside(m - part * step);
-        const Eigen::Vector2d next_error = next + decentring_.shift(next) - bent;
+        const Eigen::Vector2d next = inside(a - part * step);
+        const Eigen::Vector2d next_error = errorOf(next);
         if (next_error.norm() < size) {
-          m = next;
+          a = next;
           error = next_error;
           break;
         }
@@ -283,7 +333,6 @@ class CentralLens final : public LensModel {
   Eigen::Matrix2d inverse_linear_ = Eigen::Matrix2d::Identity();
   double p_ = 0.0;
   Decentring decentring_;
-  double plane_radius_ = 0.0;  // tan(max_theta / 2)
   double max_theta_ = 0.0;
   double cos_max_ = 1.0;
 };

@@ -608,15 +608,21 @@ TEST(Decentring, IsBrownsTangentialTerms) {
   auto with = plain;
   with["d1"] = {kD1};
   with["d2"] = {kD2};
-  // Stereographic: sensor coordinates are 2 f m.
+  // Stereographic: sensor coordinates are 2 f tan(theta / 2).
   const LensPtr lens = makeLens("asphere", {0.0, 0.0}, with, 2.0, "test");
   for (const auto& n : field(2.0, 20, 9)) {
     const double x = n.x() / (1 + n.z());
     const double y = n.y() / (1 + n.z());
     const double rr = x * x + y * y;
-    const Eigen::Vector2d expected(x + 2 * kD1 * x * y + kD2 * (rr + 2 * x * x),
-                                   y + kD1 * (rr + 2 * y * y) + 2 * kD2 * x * y);
-    EXPECT_LT((*lens->project(n) - 600.0 * expected).norm(), 1e-9);
+    const double sine = n.head<2>().norm();
+    Eigen::Vector2d angles = n.head<2>();
+    if (sine > 0.0) angles *= std::atan2(sine, n.z()) / sine;
+    angles += (1 + rr) * Eigen::Vector2d(2 * kD1 * x * y + kD2 * (rr + 2 * x * x),
+                                         kD1 * (rr + 2 * y * y) + 2 * kD2 * x * y);
+    const double theta = angles.norm();
+    Eigen::Vector2d expected = Eigen::Vector2d::Zero();
+    if (theta > 0.0) expected = 600.0 * std::tan(0.5 * theta) / theta * angles;
+    EXPECT_LT((*lens->project(n) - expected).norm(), 1e-9);
   }
   with["d1"] = {0.2};  // folds over within the field
   EXPECT_THROW(makeLens("asphere", {0.0, 0.0}, with, 2.0, "test"), InputError);
