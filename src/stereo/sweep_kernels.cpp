@@ -60,32 +60,49 @@ void HalveRows(const PaddedImage& image, PaddedImage* out, int begin, int end) {
 
 void SampleRow(const PaddedImage& image, const float* x, const float* y, const std::uint8_t* mask,
                int runs, std::uint8_t* grey) {
-  const std::ptrdiff_t stride = image.stride;
-  const std::uint8_t* origin = image.row(0);
+  const hn::CappedTag<std::int32_t, 8> d;
+  const hn::Rebind<std::uint8_t, decltype(d)> d8;
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  const auto stride = hn::Set(d, image.stride);
+  const auto* corner = reinterpret_cast<const std::int32_t*>(
+      image.row(0) - PaddedImage::kPad * (static_cast<std::ptrdiff_t>(image.stride) + 1));
+  const auto byte = hn::Set(d, 0xFF);
   for (int n = 0; n < runs; ++n, grey += 8) {
     if (mask[n] == 0) {
       std::memset(grey, 0, 8);
       continue;
     }
-    // 16 bits below the point, counted from the corner of the padding so that all are positive.
+    // 16 bits below the point, of which 7 are used, rounded; counted from the corner of the padding
+    // so that all are positive.
     constexpr float kOne = 65536.0f;
-    const std::int32_t u0 = static_cast<std::int32_t>((x[n] + PaddedImage::kPad) * kOne);
-    const std::int32_t v0 = static_cast<std::int32_t>((y[n] + PaddedImage::kPad) * kOne);
-    const std::int32_t du = static_cast<std::int32_t>((x[n + 1] - x[n]) * (kOne / 8));
-    const std::int32_t dv = static_cast<std::int32_t>((y[n + 1] - y[n]) * (kOne / 8));
-    const std::uint8_t* corner = origin - PaddedImage::kPad * (stride + 1);
-    for (int i = 0; i < 8; ++i) {
-      if (!(mask[n] >> i & 1)) {
-        grey[i] = 0;
-        continue;
-      }
-      const std::int32_t u = u0 + i * du, v = v0 + i * dv;
-      const std::uint8_t* p = corner + (v >> 16) * stride + (u >> 16);
-      const int fu = (u >> 9) & 127, fv = (v >> 9) & 127;
-      const int top = (p[0] << 7) + (p[1] - p[0]) * fu;
-      const int bottom = (p[stride] << 7) + (p[stride + 1] - p[stride]) * fu;
-      const int value = ((top << 7) + (bottom - top) * fv + 8192) >> 14;
-      grey[i] = static_cast<std::uint8_t>(std::max(value, 1));
+    const auto u0 = static_cast<std::int32_t>((x[n] + PaddedImage::kPad) * kOne + 256.0f);
+    const auto v0 = static_cast<std::int32_t>((y[n] + PaddedImage::kPad) * kOne + 256.0f);
+    const auto du = static_cast<std::int32_t>((x[n + 1] - x[n]) * (kOne / 8));
+    const auto dv = static_cast<std::int32_t>((y[n + 1] - y[n]) * (kOne / 8));
+    for (int i = 0; i < 8; i += lanes) {
+      const auto step = hn::Iota(d, i);
+      // Cells that the mask leaves out may lie anywhere: they ask for the first pixel.
+      const auto bit = hn::And(hn::Shr(hn::Set(d, mask[n]), step), hn::Set(d, 1));
+      const auto inside = hn::Ne(bit, hn::Zero(d));
+      const auto u =
+          hn::IfThenElseZero(inside, hn::Add(hn::Set(d, u0), hn::Mul(step, hn::Set(d, du))));
+      const auto v =
+          hn::IfThenElseZero(inside, hn::Add(hn::Set(d, v0), hn::Mul(step, hn::Set(d, dv))));
+      const auto at = hn::Add(hn::Mul(hn::ShiftRight<16>(v), stride), hn::ShiftRight<16>(u));
+      const auto upper = hn::GatherOffset(d, corner, at);
+      const auto lower = hn::GatherOffset(d, corner, hn::Add(at, stride));
+      const auto fu = hn::And(hn::ShiftRight<9>(u), hn::Set(d, 127));
+      const auto fv = hn::And(hn::ShiftRight<9>(v), hn::Set(d, 127));
+      const auto across = [&](auto pair) {
+        const auto p = hn::And(pair, byte);
+        const auto q = hn::And(hn::ShiftRight<8>(pair), byte);
+        return hn::Add(hn::ShiftLeft<7>(p), hn::Mul(hn::Sub(q, p), fu));
+      };
+      const auto top = across(upper), bottom = across(lower);
+      const auto sum = hn::Add(hn::ShiftLeft<7>(top), hn::Mul(hn::Sub(bottom, top), fv));
+      const auto value = hn::ShiftRight<14>(hn::Add(sum, hn::Set(d, 8192)));
+      const auto seen = hn::IfThenElseZero(inside, hn::Max(value, hn::Set(d, 1)));
+      hn::StoreU(hn::DemoteTo(d8, seen), d8, grey + i);
     }
   }
 }
@@ -202,8 +219,8 @@ HWY_INLINE std::uint16_t LeastLane(D d, V v) {
 
 template <int kLanes>
 void MatchLanes(const ChunkJob& job) {
-  const int window = 2 * job.radius + 1;
-  const int tile_width = job.width - 2 * job.radius;
+  constexpr int window = kWindow;
+  const int tile_width = job.width - 2 * kRadius;
   const std::size_t line = static_cast<std::size_t>(job.width) * kLanes;
   job.scratch->assign(line * (window + 1) + 256, 0);
   std::uint8_t* HWY_RESTRICT sums = job.scratch->data();
@@ -313,8 +330,15 @@ void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
     const auto row = hn::NearestInt(hn::Add(
         hn::Mul(hn::ConvertTo(df, p), hn::Set(df, job.row_scale)), hn::Set(df, job.row_offset)));
     const auto inside = hn::Min(hn::Max(row, hn::Zero(di)), hn::Set(di, job.rows - 1));
-    const auto column = hn::Mul(hn::LoadU(df, a + x), hn::Set(df, job.to_column));
-    const auto whole = hn::NearestInt(column);
+    const auto slope = hn::Mul(hn::ConvertTo(df, hn::Iota(di, x)), hn::Set(df, job.guess_x));
+    const auto column = hn::Add(hn::Mul(hn::LoadU(df, a + x), hn::Set(df, job.to_column)),
+                                hn::Add(slope, hn::Set(df, job.guess)));
+    const auto pattern = hn::And(
+        hn::Add(hn::Mul(hn::Iota(di, x), hn::Set(di, kDitherX)), hn::Set(di, job.dither_phase)),
+        hn::Set(di, 255));
+    const auto dither = hn::Mul(hn::ConvertTo(df, hn::Sub(pattern, hn::Set(di, 128))),
+                                hn::Set(df, job.dither / 256.0f));
+    const auto whole = hn::NearestInt(hn::Add(column, dither));
     const auto none = hn::Eq(p, hn::Set(di, kNoRay));
     const auto cell = hn::Add(hn::GatherIndex(di, job.origin, inside), whole);
     hn::StoreU(hn::IfThenElse(none, hn::Set(di, -1), cell), di, base + x);
@@ -323,23 +347,25 @@ void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
   }
 }
 
-void BoxMeanRow(const float* in, int stride, int radius, int count, float* HWY_RESTRICT line,
+void BoxMeanRow(const float* in, int stride, int count, float* HWY_RESTRICT line,
                 float* HWY_RESTRICT out) {
-  const int window = 2 * radius + 1;
-  for (int x = 0; x < count + window - 1; ++x) {
-    float sum = 0;
-    for (int k = 0; k < window; ++k) sum += in[k * stride + x];
-    line[x] = sum;
+  const hn::ScalableTag<float> d;
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  for (int x = 0; x < count + kWindow - 1; x += lanes) {
+    auto sum = hn::LoadU(d, in + x);
+    for (int k = 1; k < kWindow; ++k) sum = hn::Add(sum, hn::LoadU(d, in + k * stride + x));
+    hn::StoreU(sum, d, line + x);
   }
-  const float scale = 1.0f / static_cast<float>(window * window);
-  for (int x = 0; x < count; ++x) {
-    float sum = 0;
-    for (int k = 0; k < window; ++k) sum += line[x + k];
-    out[x] = sum * scale;
+  const auto scale = hn::Set(d, 1.0f / (kWindow * kWindow));
+  for (int x = 0; x < count; x += lanes) {
+    auto sum = hn::LoadU(d, line + x);
+    for (int k = 1; k < kWindow; ++k) sum = hn::Add(sum, hn::LoadU(d, line + x + k));
+    hn::StoreU(hn::Mul(sum, scale), d, out + x);
   }
 }
 
-void ConcludeRow(const ConcludeJob& job) {
+void ConcludeRow(ConcludeJob* in_out) {
+  ConcludeJob& job = *in_out;
   const hn::ScalableTag<float> df;
   const hn::RebindToSigned<decltype(df)> di;
   const hn::Rebind<std::uint16_t, decltype(df)> du16;
@@ -348,6 +374,7 @@ void ConcludeRow(const ConcludeJob& job) {
   const auto load = [&](const std::uint16_t* p) {
     return hn::ConvertTo(df, hn::PromoteTo(di, hn::LoadU(du16, p)));
   };
+  auto first = hn::Set(di, job.claim_first), last = hn::Set(di, job.claim_last);
   for (int x = 0; x < job.count; x += lanes) {
     const auto c = load(job.cost + x), before = load(job.before + x), after = load(job.after + x);
     const auto k = hn::PromoteTo(di, hn::LoadU(di16, job.index + x));
@@ -364,12 +391,18 @@ void ConcludeRow(const ConcludeJob& job) {
     good = hn::And(good, hn::Ne(phi, hn::Set(di, kNoRay)));
     auto fine = hn::And(hn::RebindMask(df, good), hn::Gt(steep, hn::Zero(df)));
     fine = hn::And(fine, hn::Le(c, hn::Set(df, job.worst_cost)));
-    // Two lines of equal slope through the three costs.
-    const auto shift = hn::Div(hn::Mul(hn::Sub(before, after), hn::Set(df, 0.5f)),
-                               hn::Max(steep, hn::Set(df, 1.0f)));
-    const auto h =
-        hn::Mul(hn::Add(hn::Add(hn::ConvertTo(df, k), shift), hn::LoadU(df, job.residual + x)),
-                hn::Set(df, job.step_h));
+    // The pixels of a window fall between columns, each elsewhere: their sum is rounder than two
+    // lines and sharper than a parabola. With this gain a shift of all columns leaves no bias.
+    constexpr float kGain = 0.62f;
+    const auto shift =
+        hn::Div(hn::Mul(hn::Sub(before, after), hn::Set(df, kGain)),
+                hn::Max(hn::Sub(hn::Add(before, after), hn::Add(c, c)), hn::Set(df, 1.0f)));
+    const auto guess =
+        hn::Add(hn::Mul(hn::ConvertTo(df, hn::Iota(di, x)), hn::Set(df, job.guess_x)),
+                hn::Set(df, job.guess));
+    const auto columns =
+        hn::Add(hn::Add(hn::ConvertTo(df, k), shift), hn::LoadU(df, job.residual + x));
+    const auto h = hn::Mul(hn::Add(columns, guess), hn::Set(df, job.step_h));
     hn::StoreU(hn::IfThenElse(fine, h, hn::NaN(df)), df, job.h + x);
     if (job.steep) {
       hn::StoreU(hn::DemoteTo(du16, hn::ConvertTo(di, hn::Max(steep, hn::Zero(df)))), du16,
@@ -387,9 +420,15 @@ void ConcludeRow(const ConcludeJob& job) {
       const auto column = hn::Min(hn::Max(u, hn::Zero(di)), hn::Set(di, job.claim_width - 1));
       const auto row = hn::Min(hn::Max(v, hn::Zero(di)), hn::Set(di, job.claim_height - 1));
       const auto at = hn::Add(hn::Mul(row, hn::Set(di, job.claim_width)), column);
-      hn::StoreU(hn::IfThenElse(hn::RebindMask(di, fine), at, hn::Set(di, -1)), di, job.claim + x);
+      const auto counted =
+          hn::And(hn::RebindMask(di, fine), hn::Lt(hn::Iota(di, x), hn::Set(di, job.count)));
+      hn::StoreU(hn::IfThenElse(counted, at, hn::Set(di, -1)), di, job.claim + x);
+      first = hn::Min(first, hn::IfThenElse(counted, row, first));
+      last = hn::Max(last, hn::IfThenElse(counted, row, last));
     }
   }
+  job.claim_first = hn::GetLane(hn::MinOfLanes(di, first));
+  job.claim_last = hn::GetLane(hn::MaxOfLanes(di, last));
 }
 
 std::size_t CheckRow(const std::uint32_t* claims, const std::int32_t* claim, float to_units,
@@ -583,11 +622,11 @@ void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
   HWY_DYNAMIC_DISPATCH(MapRow)(job, phi, a, count, base, residual);
 }
 
-void boxMeanRow(const float* in, int stride, int radius, int count, float* line, float* out) {
-  HWY_DYNAMIC_DISPATCH(BoxMeanRow)(in, stride, radius, count, line, out);
+void boxMeanRow(const float* in, int stride, int count, float* line, float* out) {
+  HWY_DYNAMIC_DISPATCH(BoxMeanRow)(in, stride, count, line, out);
 }
 
-void concludeRow(const ConcludeJob& job) { HWY_DYNAMIC_DISPATCH(ConcludeRow)(job); }
+void concludeRow(ConcludeJob* job) { HWY_DYNAMIC_DISPATCH(ConcludeRow)(job); }
 
 std::size_t checkRow(const std::uint32_t* claims, const std::int32_t* claim, float to_units,
                      float tolerance, float* h, int count) {

@@ -33,22 +33,23 @@ struct PaddedImage {
   }
 };
 
+inline constexpr int kRadius = 3;  ///< of the box that costs are summed over
+inline constexpr int kWindow = 2 * kRadius + 1;
 inline constexpr int kBits = 24;   ///< of a descriptor: 5x5 less the centre
 inline constexpr int kPlanes = 3;  ///< its bytes, each in an array of its own
 
 /// One tile's descriptors, the cells they are compared with, and the window. Arrays by pixel have
 /// `stride` elements a row.
 struct ChunkJob {
-  int width = 0, height = 0;  ///< of the tile with its halo of `radius`
+  int width = 0, height = 0;  ///< of the tile with its halo of kRadius
   int stride = 0;
-  int radius = 3;
   int lanes = 32;  ///< hypotheses tried: 16 or 32; the outer two only serve as neighbours
   const std::int32_t* base = nullptr;  ///< cell of hypothesis 0, by pixel
   int first = 0;                       ///< hypothesis of lane 0
   std::int32_t cells_end = 0;          ///< cells at or behind it are not asked for
   const std::uint8_t* reference[kPlanes] = {};
   const std::uint8_t* cells[kPlanes] = {};
-  /// State by pixel of the tile without halo, `width - 2 radius` a row; a chunk replaces it where
+  /// State by pixel of the tile without halo, `width - 2 kRadius` a row; a chunk replaces it where
   /// it finds a lower cost.
   std::uint16_t* cost = nullptr;  ///< 0xFFFF at first
   std::int16_t* index = nullptr;
@@ -86,21 +87,29 @@ void censusBlock(const std::int16_t* grey, int grey_stride, int width, int heigh
                  const CensusOffsets& offsets, bool narrow, std::uint8_t* const out[kPlanes],
                  int stride);
 
+/// Steps of the dither pattern from pixel to pixel and from row to row [1/256].
+inline constexpr int kDitherX = 98, kDitherY = 159;
+
 /// From epipolar coordinates to cells.
 struct MapJob {
   float row_scale = 0, row_offset = 0;
   int rows = 0;
   const std::int32_t* origin = nullptr;  ///< by row
   float to_column = 0;
+  /// Columns by which rounding is spread out, 0 or 1, and the row's phase in the pattern [1/256].
+  float dither = 0;
+  int dither_phase = 0;
+
+  float guess = 0, guess_x = 0;  ///< expected hypothesis [columns], and its change a pixel
 };
 /// @param base [out] cell, -1 where there is no ray
 /// @param residual [out] whole column less exact column; 0 where there is no ray
 void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int count,
             std::int32_t* base, float* residual);
 
-/// Mean of a square window, for `count` pixels of a row whose windows begin at `in`.
-/// @param line room for count + 2 radius
-void boxMeanRow(const float* in, int stride, int radius, int count, float* line, float* out);
+/// Mean of the window, for `count` pixels of a row whose windows begin at `in`.
+/// @param line room for count + kWindow
+void boxMeanRow(const float* in, int stride, int count, float* line, float* out);
 
 /// From costs to hypotheses, one row of a tile.
 struct ConcludeJob {
@@ -116,15 +125,17 @@ struct ConcludeJob {
   const std::uint8_t* mask = nullptr;  ///< of the grid
   std::int32_t cells = 0;
   float step_h = 0;
+  float guess = 0, guess_x = 0;  ///< as in MapJob, from the row's first pixel
   float worst_cost = 0;
   float* h = nullptr;              ///< [out] NaN where nothing was found
   std::uint16_t* steep = nullptr;  ///< [out] rise of cost to the higher neighbour; may be null
   // Where the match falls on the claims image; skipped when claim is null.
   float claim_x = 0, claim_y = 0, claim_y_offset = 0;
   int claim_width = 0, claim_height = 0;
-  std::int32_t* claim = nullptr;  ///< [out] -1 where nothing was found
+  std::int32_t* claim = nullptr;                          ///< [out] -1 where nothing was found
+  std::int32_t claim_first = INT32_MAX, claim_last = -1;  ///< [in, out] rows of it, widened
 };
-void concludeRow(const ConcludeJob& job);
+void concludeRow(ConcludeJob* job);
 
 /// Makes NaN of hypotheses whose claim went to another by more than `tolerance` (in units of
 /// claims).

@@ -22,11 +22,11 @@ namespace {
 using namespace sweep;
 
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
-constexpr int kRadius = 3;  ///< of the box that costs are summed over
-constexpr int kWindow = 2 * kRadius + 1;
 constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 constexpr float kFullCost = kWindow * kWindow * kBits;  ///< every bit of every descriptor wrong
-constexpr int kSpeckle = 100;                           ///< regions of fewer pixels go
+constexpr int kNarrowLanes = 14;                        ///< hypotheses of the cheapest chunk
+constexpr int kSearchMargin = 3;      ///< columns beyond what the coarser level found
+constexpr int kSpeckle = 100;         ///< regions of fewer pixels go
 constexpr float kWorstShare = 0.36f;  ///< of it, that a match may cost; chance gives a half
 
 class Stopwatch {
@@ -53,6 +53,13 @@ struct Level {
   cv::Mat h;  ///< CV_32FC1, hypotheses found
 };
 
+/// What the next coarser level says of a tile: a plane of hypotheses through it, and how far from
+/// the plane to look. All in columns; the plane by pixels from the tile's corner.
+struct Guess {
+  float at = 0, x = 0, y = 0;
+  std::vector<std::pair<int, int>> intervals;
+};
+
 /// What a thread keeps between tiles.
 struct Scratch {
   std::vector<std::int32_t> base;
@@ -63,6 +70,8 @@ struct Scratch {
   std::vector<std::uint16_t> cost, before, after;
   std::vector<std::int16_t> index;
   std::vector<int> histogram;
+  std::vector<Eigen::Vector3f> samples;
+  Guess guess;
 };
 
 /// A plane of one value a pixel; vector code may write up to 64 elements behind the end of a row.
@@ -220,49 +229,89 @@ class SweepMatcher : public Matcher {
     }
   }
 
-  /// Intervals of columns worth trying in a tile, by what the next coarser level found.
-  std::vector<std::pair<int, int>> intervals(std::size_t l, const Tile& tile, const Band& band,
-                                             Scratch* scratch) const {
-    const int least = static_cast<int>(std::floor(tile.h_min / band.step_h)) - 1;
-    const int most = static_cast<int>(std::ceil(tile.h_max / band.step_h)) + 1;
-    const std::vector<std::pair<int, int>> all{{least, most}};
-    if (l + 1 == levels_.size()) return all;
+  void guessTile(std::size_t l, const Tile& tile, const Band& band, Scratch* scratch) const {
+    Guess& guess = scratch->guess;
+    guess.at = guess.x = guess.y = 0;
+    const float to_columns = static_cast<float>(1 / band.step_h);
+    const int least = static_cast<int>(std::floor(tile.h_min * to_columns)) - 1;
+    const int most = static_cast<int>(std::ceil(tile.h_max * to_columns)) + 1;
+    guess.intervals.assign(1, {least, most});
+    if (l + 1 == levels_.size()) return;
     const cv::Mat& coarse = levels_[l + 1].h;
     constexpr int kAround = 6;
-    const int x0 = std::max(tile.rect.x / 2 - kAround, 0),
-              y0 = std::max(tile.rect.y / 2 - kAround, 0);
+    const int x0 = std::max(tile.rect.x / 2 - kAround, 0);
+    const int y0 = std::max(tile.rect.y / 2 - kAround, 0);
     const int x1 = std::min(tile.rect.br().x / 2 + kAround, coarse.cols);
     const int y1 = std::min(tile.rect.br().y / 2 + kAround, coarse.rows);
-    std::vector<int>& histogram = scratch->histogram;
-    histogram.assign(most - least + 1, 0);
-    int seen = 0, known = 0;
-    for (int y = y0; y < y1; ++y) {
+    std::vector<Eigen::Vector3f>& samples = scratch->samples;  // x, y, columns
+    samples.clear();
+    int seen = 0;
+    for (int y = y0; y < y1; y += 2) {
       const float* line = coarse.ptr<float>(y);
-      for (int x = x0; x < x1; ++x) {
+      for (int x = x0 + (y / 2 % 2); x < x1; x += 2) {
         ++seen;
-        if (std::isnan(line[x])) continue;
-        const int k = static_cast<int>(std::lround(line[x] / band.step_h)) - least;
-        ++histogram[std::clamp(k, 0, most - least)];
-        ++known;
+        if (!std::isnan(line[x])) {
+          samples.emplace_back(2 * x + 0.5f - tile.rect.x, 2 * y + 0.5f - tile.rect.y,
+                               line[x] * to_columns);
+        }
       }
     }
-    if (known * 8 < seen) return all;
+    if (static_cast<int>(samples.size()) * 8 < seen) return;
+    if (most - least > kNarrowLanes) fitPlane(samples, &guess);
+
     // A few stray pixels do not widen the search; a thin object does.
-    const int needed = std::max(2, known / 400);
-    constexpr int kMargin = 3;
-    std::vector<std::pair<int, int>> found;
-    for (int k = 0; k <= most - least; ++k) {
-      const int around =
-          histogram[k] + (k ? histogram[k - 1] : 0) + (k < most - least ? histogram[k + 1] : 0);
-      if (histogram[k] == 0 || around < needed) continue;
-      const int from = std::max(least + k - kMargin, least),
-                to = std::min(least + k + kMargin, most);
-      if (!found.empty() && from <= found.back().second + 3)
-        found.back().second = std::max(to, found.back().second);
-      else
-        found.emplace_back(from, to);
+    constexpr float kFurthest = 2048;
+    std::vector<int>& histogram = scratch->histogram;
+    float low = kFurthest, high = -kFurthest;
+    for (Eigen::Vector3f& s : samples) {
+      s.z() -= guess.at + guess.x * s.x() + guess.y * s.y();
+      low = std::min(low, s.z());
+      high = std::max(high, s.z());
     }
-    return found.empty() ? all : found;
+    const int from = static_cast<int>(std::lround(std::max(low, -kFurthest)));
+    const int bins = static_cast<int>(std::lround(std::min(high, kFurthest))) - from + 1;
+    histogram.assign(bins + 2, 0);
+    for (const Eigen::Vector3f& s : samples)
+      ++histogram[1 + std::clamp(static_cast<int>(std::lround(s.z())) - from, 0, bins - 1)];
+    const int needed = std::max(2, static_cast<int>(samples.size()) / 400);
+    guess.intervals.clear();
+    for (int k = 1; k <= bins; ++k) {
+      if (histogram[k] == 0 || histogram[k - 1] + histogram[k] + histogram[k + 1] < needed)
+        continue;
+      const int first = from + k - 1 - kSearchMargin, last = from + k - 1 + kSearchMargin;
+      if (!guess.intervals.empty() && first <= guess.intervals.back().second + 4)
+        guess.intervals.back().second = last;
+      else
+        guess.intervals.emplace_back(first, last);
+    }
+    if (guess.intervals.empty()) {
+      guess.at = guess.x = guess.y = 0;
+      guess.intervals.assign(1, {least, most});
+    }
+  }
+
+  /// The plane that most samples lie on: least squares, reweighted.
+  static void fitPlane(const std::vector<Eigen::Vector3f>& samples, Guess* guess) {
+    const std::size_t stride = std::max<std::size_t>(1, samples.size() / 96);
+    Eigen::Vector3f plane = Eigen::Vector3f::Zero();
+    for (int iteration = 0; iteration < 4; ++iteration) {
+      Eigen::Matrix3f A = Eigen::Matrix3f::Zero();
+      Eigen::Vector3f b = Eigen::Vector3f::Zero();
+      for (std::size_t i = 0; i < samples.size(); i += stride) {
+        const Eigen::Vector3f row(samples[i].x() - 32, samples[i].y() - 24, 1);
+        const float error = samples[i].z() - plane.dot(row);
+        const float scale = iteration == 1 ? 6.0f : 2.0f;
+        const float weight = iteration == 0 ? 1.0f : 1 / (1 + error * error / (scale * scale));
+        A += weight * row * row.transpose();
+        b += weight * samples[i].z() * row;
+      }
+      A.diagonal().array() += 1e-3f;
+      plane = A.inverse() * b;
+      if (!plane.allFinite()) return;
+    }
+    guess->x = plane.x();
+    guess->y = plane.y();
+    guess->at = plane.z() - 32 * plane.x() - 24 * plane.y();
   }
 
   void matchLevel(std::size_t l) {
@@ -300,7 +349,10 @@ class SweepMatcher : public Matcher {
     const bool whole = x0 >= 0 && x0 + width <= map.size.width;
     scratch->phi.resize(stride + 64);
     scratch->a.resize(stride + 64);
-    for (int y = 0; y < height; ++y) {
+    guessTile(l, tile, band, scratch);
+    const Guess& guess = scratch->guess;
+    map_job.guess_x = guess.x;
+    const auto mapTile = [&](int y) {
       const int v = std::clamp(rect.y + y - kRadius, 0, map.size.height - 1);
       const std::uint16_t* phi = &map.phi[static_cast<std::size_t>(v) * map.size.width];
       const float* a = &map.a[static_cast<std::size_t>(v) * map.size.width];
@@ -316,7 +368,15 @@ class SweepMatcher : public Matcher {
         phi = scratch->phi.data();
         a = scratch->a.data();
       }
+      map_job.guess = guess.at + guess.y * static_cast<float>(y - kRadius) - guess.x * kRadius;
+      map_job.dither_phase = y * kDitherY;
       mapRow(map_job, phi, a, width, &scratch->base[y * stride], &scratch->residual[y * stride]);
+    };
+    for (int y = 0; y < height; ++y) mapTile(y);
+    // Where pixels and columns run in step, costs peak sharply and would lock on to columns.
+    if (inStep(&scratch->residual[0], stride, width, height)) {
+      map_job.dither = 1;
+      for (int y = 0; y < height; ++y) mapTile(y);
     }
     describeTile(l, tile, band, stride, scratch);
 
@@ -329,7 +389,7 @@ class SweepMatcher : public Matcher {
     job.width = width;
     job.height = height;
     job.stride = stride;
-    job.radius = kRadius;
+
     job.base = scratch->base.data();
     job.cells_end = level.grid.cells;
     for (int p = 0; p < kPlanes; ++p) {
@@ -341,13 +401,36 @@ class SweepMatcher : public Matcher {
     job.before = scratch->before.data();
     job.after = scratch->after.data();
     job.scratch = &scratch->costs;
-    for (const auto& [from, to] : intervals(l, tile, band, scratch)) {
+    for (const auto& [from, to] : guess.intervals) {
       for (job.first = from - 1; job.first < to; job.first += job.lanes - 2) {
         job.lanes = to - job.first < 15 ? 16 : 32;
         matchChunk(job);
       }
     }
     concludeTile(l, t, stride, scratch);
+  }
+
+  /// Whether the pixels of most windows fall on columns alike, so that rounding does not average
+  /// out.
+  static bool inStep(const float* residual, int stride, int width, int height) {
+    int alike = 0, all = 0;
+    for (int y = 0; y + kWindow <= height; y += 3 * kWindow) {
+      for (int x = 0; x + kWindow <= width; x += 2 * kWindow) {
+        float sum = 0, squares = 0;
+        for (int v = y; v < y + kWindow; ++v) {
+          for (int u = x; u < x + kWindow; ++u) {
+            const float r = residual[v * stride + u];
+            sum += r;
+            squares += r * r;
+          }
+        }
+        constexpr float kCount = kWindow * kWindow;
+        // Spread evenly over a column the variance is 1/12.
+        alike += squares / kCount - sum * sum / (kCount * kCount) < 0.04f;
+        ++all;
+      }
+    }
+    return 2 * alike > all;
   }
 
   /// Census of the tile's pixels and halo in the local epipolar frames.
@@ -417,6 +500,8 @@ class SweepMatcher : public Matcher {
     job.mask = level.grid.mask.data();
     job.cells = level.grid.cells;
     job.step_h = static_cast<float>(band.step_h);
+    const Guess& guess = scratch->guess;
+    job.guess_x = guess.x;
     job.worst_cost = kWorstShare * kFullCost;
     job.claim_x = claim_x_;
     job.claim_y = claim_x_;
@@ -424,8 +509,8 @@ class SweepMatcher : public Matcher {
     job.claim_width = claim_size_.width;
     job.claim_height = claim_size_.height;
     for (int y = 0; y < rect.height; ++y) {
-      boxMeanRow(&scratch->residual[y * stride], stride, kRadius, rect.width,
-                 scratch->residual_line.data(), scratch->residual_mean.data());
+      boxMeanRow(&scratch->residual[y * stride], stride, rect.width, scratch->residual_line.data(),
+                 scratch->residual_mean.data());
       const std::size_t i = static_cast<std::size_t>(y) * rect.width;
       const std::size_t pixel =
           static_cast<std::size_t>(rect.y + y) * level.map.size.width + rect.x;
@@ -442,24 +527,17 @@ class SweepMatcher : public Matcher {
         job.claim = claim_.ptr<std::int32_t>(rect.y + y) + rect.x;
         std::copy(job.cost, job.cost + rect.width, cost_.ptr<std::uint16_t>(rect.y + y) + rect.x);
       }
-      concludeRow(job);
+      job.guess = guess.at + guess.y * static_cast<float>(y);
+      concludeRow(&job);
     }
     if (l > 0) return;
-    std::int32_t least = std::numeric_limits<std::int32_t>::max(), most = -1;
-    for (int y = 0; y < rect.height; ++y) {
-      const std::int32_t* claim = claim_.ptr<std::int32_t>(rect.y + y) + rect.x;
-      for (int x = 0; x < rect.width; ++x) {
-        most = std::max(most, claim[x]);
-        least = std::min(least, claim[x] < 0 ? std::numeric_limits<std::int32_t>::max() : claim[x]);
-      }
-    }
-    claim_rows_[t] = {least / claim_size_.width, most < 0 ? -1 : most / claim_size_.width};
+    claim_rows_[t] = {job.claim_first, job.claim_last};
   }
 
   /// Two pixels that see one spot of the displaced image: the better match has it.
   void claimAll() {
     Level& level = levels_.front();
-    constexpr int kStrip = 64;
+    constexpr int kStrip = 160;
     const int strips = (claim_size_.height + kStrip - 1) / kStrip;
     const float to_units = 4 / finest_step_;
     parallelFor(0, strips, options_.threads, [&](std::size_t s) {
