@@ -181,10 +181,13 @@ cv::Mat viewingRays(const LensModel& lens, cv::Size size, int threads) {
   return rays;
 }
 
-Cloud makeCloud(const MatchResult& match, const cv::Mat& rays, const cv::Mat& image, int threads) {
+namespace {
+
+// Shared by both ways to get the rays: `raysOf(v, scratch)` gives those of a row.
+template <typename Scratch, typename RaysOf>
+Cloud cloudOf(const MatchResult& match, const cv::Mat& image, int threads, const RaysOf& raysOf) {
   const cv::Size size = match.range.size();
-  if (rays.size() != size || rays.type() != CV_32FC3 || image.size() != size ||
-      (image.type() != CV_8UC1 && image.type() != CV_8UC3)) {
+  if (image.size() != size || (image.type() != CV_8UC1 && image.type() != CV_8UC3)) {
     throw Error(
         "range, rays and image of a cloud differ in size, or the image is not 8-bit grey or BGR");
   }
@@ -198,25 +201,162 @@ Cloud makeCloud(const MatchResult& match, const cv::Mat& rays, const cv::Mat& im
   } else {
     cloud.bgr = image;
   }
-  parallelFor(0, static_cast<std::size_t>(size.height), threads, [&](std::size_t row) {
-    const int v = static_cast<int>(row);
-    const auto* range = match.range.ptr<float>(v);
-    const auto* ray = rays.ptr<cv::Vec3f>(v);
-    auto* xyz = cloud.xyz.ptr<cv::Vec3f>(v);
-    for (int u = 0; u < size.width; ++u) {
-      xyz[u] = std::isfinite(range[u]) ? range[u] * ray[u] : cv::Vec3f(kNan, kNan, kNan);
-    }
-    if (grey) {
-      const auto* from = image.ptr<uchar>(v);
-      auto* to = cloud.bgr.ptr<cv::Vec3b>(v);
-      for (int u = 0; u < size.width; ++u) to[u] = cv::Vec3b::all(from[u]);
+  // Blocks of rows, so that scratch memory is not asked for row by row.
+  constexpr int kBlock = 16;
+  const std::size_t blocks = (size.height + kBlock - 1) / kBlock;
+  parallelFor(0, blocks, threads, [&](std::size_t block) {
+    Scratch scratch;
+    const int end = std::min(static_cast<int>(block + 1) * kBlock, size.height);
+    for (int v = static_cast<int>(block) * kBlock; v < end; ++v) {
+      const auto* range = match.range.ptr<float>(v);
+      auto* xyz = cloud.xyz.ptr<cv::Vec3f>(v);
+      const cv::Vec3f* ray = raysOf(v, scratch, xyz);
+      for (int u = 0; u < size.width; ++u) {
+        const float r = range[u];
+        // NaN and infinity alike fail the comparison.
+        const float valid = std::abs(r) <= std::numeric_limits<float>::max() ? r : kNan;
+        xyz[u] = cv::Vec3f(valid * ray[u][0], valid * ray[u][1], valid * ray[u][2]);
+      }
+      if (grey) {
+        const auto* from = image.ptr<uchar>(v);
+        auto* to = cloud.bgr.ptr<cv::Vec3b>(v);
+        for (int u = 0; u < size.width; ++u) to[u] = cv::Vec3b(from[u], from[u], from[u]);
+      }
     }
   });
   return cloud;
 }
 
+cv::Vec3f rayOf(const LensModel& lens, double u, double v) {
+  const auto ray = lens.unproject({u, v});
+  if (!ray) return {kNan, kNan, kNan};
+  return {static_cast<float>(ray->x()), static_cast<float>(ray->y()), static_cast<float>(ray->z())};
+}
+
+constexpr int kCell = 8;
+
+// The cubic through the nodes at -1, 0, 1 and 2.
+void cubicWeights(float t, float* weights) {
+  weights[0] = -t * (t - 1.0f) * (t - 2.0f) / 6.0f;
+  weights[1] = (t + 1.0f) * (t - 1.0f) * (t - 2.0f) / 2.0f;
+  weights[2] = -(t + 1.0f) * t * (t - 2.0f) / 2.0f;
+  weights[3] = (t + 1.0f) * t * (t - 1.0f) / 6.0f;
+}
+
+struct CellWeights {
+  CellWeights() {
+    for (int i = 0; i < kCell; ++i) cubicWeights(static_cast<float>(i) / kCell, weights[i]);
+  }
+  float weights[kCell][4];
+};
+const CellWeights kCellWeights;
+
+}  // namespace
+
+Cloud makeCloud(const MatchResult& match, const cv::Mat& rays, const cv::Mat& image, int threads) {
+  if (rays.size() != match.range.size() || rays.type() != CV_32FC3) {
+    throw Error("range and rays of a cloud differ in size");
+  }
+  struct None {};
+  return cloudOf<None>(match, image, threads,
+                       [&](int v, None&, cv::Vec3f*) { return rays.ptr<cv::Vec3f>(v); });
+}
+
 Cloud makeCloud(const MatchResult& match, const LensModel& lens, const cv::Mat& image) {
   return makeCloud(match, viewingRays(lens, match.range.size()), image);
+}
+
+PointMaker::PointMaker(const LensModel& lens, cv::Size size, int threads)
+    : size_(size),
+      cells_((size.width + kCell - 1) / kCell, (size.height + kCell - 1) / kCell),
+      nodes_(cells_.height + 3, cells_.width + 3, CV_32FC3),
+      exact_offset_(cells_.area(), -1) {
+  parallelFor(0, static_cast<std::size_t>(nodes_.rows), threads, [&](std::size_t j) {
+    auto* row = nodes_.ptr<cv::Vec3f>(static_cast<int>(j));
+    for (int i = 0; i < nodes_.cols; ++i) {
+      row[i] = rayOf(lens, (i - 1.0) * kCell, (static_cast<double>(j) - 1.0) * kCell);
+    }
+  });
+  // A cell is interpolated where that is right in its middle, where a cubic is furthest off; NaN
+  // fails.
+  std::vector<char> interpolated(cells_.area());
+  parallelFor(0, static_cast<std::size_t>(cells_.height), threads, [&](std::size_t row) {
+    const int j = static_cast<int>(row);
+    const float* middle = kCellWeights.weights[kCell / 2];
+    for (int i = 0; i < cells_.width; ++i) {
+      cv::Vec3f ray(0.0f, 0.0f, 0.0f);
+      for (int k = 0; k < 16; ++k) {
+        ray += middle[k / 4] * middle[k % 4] * nodes_.at<cv::Vec3f>(j + k / 4, i + k % 4);
+      }
+      const cv::Vec3f truth = rayOf(lens, (i + 0.5) * kCell, (j + 0.5) * kCell);
+      interpolated[j * cells_.width + i] = cv::norm(ray - truth) < 5e-7;
+    }
+  });
+  std::vector<int> edge;
+  for (int cell = 0; cell < cells_.area(); ++cell) {
+    if (interpolated[cell] != 0) continue;
+    exact_offset_[cell] = static_cast<int>(edge.size()) * kCell * kCell;
+    edge.push_back(cell);
+  }
+  exact_.resize(edge.size() * kCell * kCell);
+  parallelFor(0, edge.size(), threads, [&](std::size_t k) {
+    const int u0 = edge[k] % cells_.width * kCell, v0 = edge[k] / cells_.width * kCell;
+    for (int i = 0; i < kCell * kCell; ++i) {
+      exact_[k * kCell * kCell + i] = rayOf(lens, u0 + i % kCell, v0 + i / kCell);
+    }
+  });
+}
+
+void PointMaker::row(int v, std::vector<cv::Vec3f>& nodes, cv::Vec3f* rays) const {
+  const int j = v / kCell;
+  const float* down = kCellWeights.weights[v % kCell];
+  nodes.resize(nodes_.cols);
+  const cv::Vec3f* node_rows[4];
+  for (int k = 0; k < 4; ++k) node_rows[k] = nodes_.ptr<cv::Vec3f>(j + k);
+  for (int i = 0; i < nodes_.cols; ++i) {
+    for (int c = 0; c < 3; ++c) {
+      nodes[i][c] = down[0] * node_rows[0][i][c] + down[1] * node_rows[1][i][c] +
+                    down[2] * node_rows[2][i][c] + down[3] * node_rows[3][i][c];
+    }
+  }
+  for (int i = 0; i < cells_.width; ++i) {
+    const int width = std::min(kCell, size_.width - i * kCell);
+    cv::Vec3f* out = rays + i * kCell;
+    const int offset = exact_offset_[j * cells_.width + i];
+    if (offset >= 0) {
+      std::copy_n(exact_.begin() + offset + v % kCell * kCell, width, out);
+      continue;
+    }
+    for (int u = 0; u < width; ++u) {
+      const float* across = kCellWeights.weights[u];
+      for (int c = 0; c < 3; ++c) {
+        out[u][c] = across[0] * nodes[i][c] + across[1] * nodes[i + 1][c] +
+                    across[2] * nodes[i + 2][c] + across[3] * nodes[i + 3][c];
+      }
+    }
+  }
+}
+
+Cloud PointMaker::make(const MatchResult& match, const cv::Mat& image, int threads) const {
+  if (match.range.size() != size_) throw Error("range and lens of a cloud differ in size");
+  // The rays of a row are written where its points will be.
+  return cloudOf<std::vector<cv::Vec3f>>(match, image, threads,
+                                         [&](int v, std::vector<cv::Vec3f>& nodes, cv::Vec3f* xyz) {
+                                           row(v, nodes, xyz);
+                                           return xyz;
+                                         });
+}
+
+std::size_t PointMaker::countField(const cv::Mat& mask) const {
+  std::size_t count = 0;
+  std::vector<cv::Vec3f> nodes, rays(size_.width);
+  for (int v = 0; v < size_.height; ++v) {
+    row(v, nodes, rays.data());
+    for (int u = 0; u < size_.width; ++u) {
+      count += !std::isnan(rays[u][0]) && (mask.empty() || mask.at<uchar>(v, u) != 0);
+    }
+  }
+  return count;
 }
 
 void checkCloudPath(const fs::path& path) {

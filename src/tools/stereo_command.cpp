@@ -238,18 +238,6 @@ double median(std::vector<double> values) {
   return values.size() % 2 == 1 ? values[half] : 0.5 * (values[half - 1] + values[half]);
 }
 
-// Pixels of the reference image inside the lens' field and not left out by the mask.
-std::size_t countField(const cv::Mat& rays, const cv::Mat& mask) {
-  std::size_t field = 0;
-  for (int v = 0; v < rays.rows; ++v) {
-    for (int u = 0; u < rays.cols; ++u) {
-      field +=
-          std::isfinite(rays.at<cv::Vec3f>(v, u)[0]) && (mask.empty() || mask.at<uchar>(v, u) != 0);
-    }
-  }
-  return field;
-}
-
 void runStereo(StereoArguments& arguments, bool json) {
   if (arguments.repeat < 1 || arguments.repeat > 100000) {
     throw Error("--repeat is " + std::to_string(arguments.repeat) + ", expected 1 to 100000");
@@ -269,8 +257,8 @@ void runStereo(StereoArguments& arguments, bool json) {
 
   start = Clock::now();
   const std::unique_ptr<Matcher> matcher = makeNamedMatcher(arguments, inputs.geometry);
-  const cv::Mat rays = viewingRays(*inputs.geometry.reference_lens, inputs.geometry.reference_size,
-                                   arguments.options.threads);
+  const PointMaker points(*inputs.geometry.reference_lens, inputs.geometry.reference_size,
+                          arguments.options.threads);
   const double setup_seconds = secondsSince(start);
 
   MatchResult match;
@@ -281,7 +269,7 @@ void runStereo(StereoArguments& arguments, bool json) {
     cloud = {};
     match = matcher->match(inputs.reference, inputs.displaced);
     start = Clock::now();
-    cloud = makeCloud(match, rays, inputs.color, arguments.options.threads);
+    cloud = points.make(match, inputs.color, arguments.options.threads);
     const double cloud_seconds = secondsSince(start);
     for (const auto& [stage, seconds] : match.statistics.seconds) {
       if (stage != "total") stages[stage].push_back(seconds);
@@ -290,7 +278,7 @@ void runStereo(StereoArguments& arguments, bool json) {
     stages["total"].push_back(match.statistics.seconds.at("total") + cloud_seconds);
   }
   const double working_memory = memory.working();
-  const std::size_t field = countField(rays, arguments.options.mask);
+  const std::size_t field = points.countField(arguments.options.mask);
 
   // All that can fail is done before the first output appears.
   start = Clock::now();

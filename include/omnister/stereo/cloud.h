@@ -5,6 +5,7 @@
 #include <filesystem>
 #include <memory>
 #include <opencv2/core/mat.hpp>
+#include <vector>
 
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_model.h"
@@ -30,6 +31,32 @@ cv::Mat viewingRays(const LensModel& lens, cv::Size size, int threads = 0);
 Cloud makeCloud(const MatchResult& match, const cv::Mat& rays, const cv::Mat& image,
                 int threads = 0);
 Cloud makeCloud(const MatchResult& match, const LensModel& lens, const cv::Mat& image);
+
+/// Makes clouds of one lens, frame after frame, without a ray for every pixel in memory: rays are
+/// kept at every eighth pixel and interpolated between, to 1e-6 rad; where that would
+/// not do, and where the field ends, every pixel's is kept.
+class PointMaker {
+ public:
+  /// @param threads 0: every core
+  PointMaker(const LensModel& lens, cv::Size size, int threads = 0);
+
+  /// The same as makeCloud().
+  Cloud make(const MatchResult& match, const cv::Mat& image, int threads = 0) const;
+
+  /// Pixels inside the field of the lens and, if it is not empty, not 0 in the mask.
+  /// @param mask CV_8UC1 of the size given before
+  std::size_t countField(const cv::Mat& mask = {}) const;
+
+ private:
+  /// Rays of a row, NaN outside the field. @param nodes scratch
+  void row(int v, std::vector<cv::Vec3f>& nodes, cv::Vec3f* rays) const;
+
+  cv::Size size_;
+  cv::Size cells_;                 // of 8 x 8 pixels
+  cv::Mat nodes_;                  // CV_32FC3, one node before and two after the cells
+  std::vector<int> exact_offset_;  // by cell: where its 64 rays are in exact_, -1 if interpolated
+  std::vector<cv::Vec3f> exact_;
+};
 
 /// Binary little-endian PLY: `comment width W`, `comment height H`, one vertex a pixel with x y z
 /// (float), red green blue (uchar), sigma score (float). Or PCD v0.7, organized, by the extension.

@@ -220,6 +220,45 @@ TEST(MakeCloud, PutsPointsOnTheirRays) {
   EXPECT_THROW(makeCloud(match, *lens, cv::Mat(30, 40, CV_16UC1)), Error);
 }
 
+// Interpolated rays against a projection for every pixel, where the field ends inside the image and
+// outside it.
+TEST(PointMaker, MakesTheSameCloudAsEveryRayForItself) {
+  for (const cv::Size size :
+       {cv::Size(400, 300), cv::Size(397, 301), cv::Size(9, 1), cv::Size(3, 70)}) {
+    for (double max_theta : {0.7, 1.7}) {
+      LensStructure structure;
+      structure.model = "asphere";
+      structure.even_terms = 2;
+      const LensPtr lens =
+          makeLens(structure, {0.52 * size.width, 0.47 * size.height}, 130.0, max_theta);
+      MatchResult match;
+      match.range = cv::Mat(size, CV_32FC1, cv::Scalar(1.0));
+      match.range.at<float>(0, 0) = kNan;
+      match.sigma = match.score = cv::Mat(size, CV_32FC1, cv::Scalar(0.5));
+      cv::Mat image(size, CV_8UC3);
+      cv::randu(image, 0, 255);
+      const PointMaker maker(*lens, size);
+      const Cloud fast = maker.make(match, image), slow = makeCloud(match, *lens, image);
+      double worst = 0.0;
+      std::size_t field = 0;
+      for (int v = 0; v < size.height; ++v) {
+        for (int u = 0; u < size.width; ++u) {
+          const auto& a = fast.xyz.at<cv::Vec3f>(v, u);
+          const auto& b = slow.xyz.at<cv::Vec3f>(v, u);
+          const bool valid = !std::isnan(b[0]);
+          ASSERT_EQ(!std::isnan(a[0]), valid) << u << ' ' << v;
+          if (valid) worst = std::max(worst, cv::norm(a - b));
+          field += lens->unproject({double(u), double(v)}).has_value();
+        }
+      }
+      EXPECT_LT(worst, 1e-6);
+      EXPECT_EQ(maker.countField(), field);
+      EXPECT_EQ(maker.countField(cv::Mat(size, CV_8UC1, cv::Scalar(0))), 0u);
+      EXPECT_TRUE(sameBytes(fast.bgr, image));
+    }
+  }
+}
+
 // A plane seen by a wide camera, with ranges wrong in proportion to their square, outliers and
 // holes.
 cv::Mat noisyPlane(const Eigen::Vector3d& normal, double distance, double outliers) {
