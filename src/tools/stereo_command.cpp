@@ -154,6 +154,9 @@ void checkOutputs(const StereoArguments& arguments) {
       throw InputError(output, "",
                        "cannot be written: there is no folder " + printable(folder.string()));
     }
+    if (fs::is_directory(output, ignored)) {
+      throw InputError(output, "", "cannot be written: it is a folder");
+    }
     others.push_back(output);
   }
 }

@@ -1,0 +1,283 @@
+// SPDX-License-Identifier: Apache-2.0
+// `omnister stereo` and `omnister evaluate plane` as a person calls them.
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+#include <unistd.h>
+
+#include <filesystem>
+#include <nlohmann/json.hpp>
+#include <opencv2/imgcodecs.hpp>
+#include <opencv2/imgproc.hpp>
+#include <string>
+#include <vector>
+
+#include "omnister/common/file_io.h"
+#include "omnister/lens/lens_file.h"
+#include "omnister/lens/lens_models.h"
+#include "omnister/stereo/cloud.h"
+#include "tools/command_line.h"
+#include "unit/stereo/analytic_scene.h"
+
+namespace omnister {
+namespace {
+
+namespace fs = std::filesystem;
+using ::testing::AllOf;
+using ::testing::HasSubstr;
+
+struct Outcome {
+  int code = -1;
+  std::string out, err;
+};
+
+Outcome run(std::vector<std::string> arguments) {
+  arguments.insert(arguments.begin(), "omnister");
+  std::vector<const char*> argv;
+  for (const std::string& argument : arguments) argv.push_back(argument.c_str());
+  ::testing::internal::CaptureStdout();
+  ::testing::internal::CaptureStderr();
+  Outcome outcome;
+  outcome.code = tools::runCommandLine(static_cast<int>(argv.size()), argv.data());
+  outcome.out = ::testing::internal::GetCapturedStdout();
+  outcome.err = ::testing::internal::GetCapturedStderr();
+  return outcome;
+}
+
+class StereoCommand : public ::testing::Test {
+ protected:
+  static constexpr const char* kPose = "-0.3 0 0 0 0 0 1";
+
+  void SetUp() override {
+    std::string name = (fs::temp_directory_path() / "omnister-XXXXXX").string();
+    ASSERT_NE(::mkdtemp(name.data()), nullptr);
+    folder_ = name;
+    LensFile lens;
+    lens.image_size = {128, 96};
+    lens.lens = makeLens(LensStructure{}, {63.2, 47.9}, 55.0, 1.3);
+    writeLensFile(path("lens.yaml"), lens);
+    const auto scene = test::wall(2.0, 0.25);
+    reference_ = test::look(scene, *lens.lens, lens.image_size, Pose::Identity()).image;
+    displaced_ = test::look(scene, *lens.lens, lens.image_size, test::pose(-0.3, 0, 0)).image;
+    cv::imwrite(path("reference.png"), reference_);
+    cv::imwrite(path("displaced.png"), displaced_);
+  }
+  void TearDown() override { fs::remove_all(folder_); }
+
+  std::string path(const std::string& name) const { return (folder_ / name).string(); }
+
+  // The arguments that work, with some changed ("" leaves one out) and some added.
+  std::vector<std::string> arguments(const std::map<std::string, std::string>& changed = {},
+                                     const std::vector<std::string>& added = {}) const {
+    std::map<std::string, std::string> values = {{"--lens", path("lens.yaml")},
+                                                 {"--reference", path("reference.png")},
+                                                 {"--displaced", path("displaced.png")},
+                                                 {"--pose", kPose},
+                                                 {"--min-range", "1.2"},
+                                                 {"--matcher", "thesis"},
+                                                 {"--thesis-window", "5"},
+                                                 {"--cloud", path("cloud.ply")},
+                                                 {"--range", path("range.tiff")}};
+    for (const auto& [key, value] : changed) values[key] = value;
+    std::vector<std::string> result = {"stereo"};
+    for (const auto& [key, value] : values) {
+      if (value.empty()) continue;
+      result.push_back(key);
+      result.push_back(value);
+    }
+    result.insert(result.end(), added.begin(), added.end());
+    return result;
+  }
+
+  // A refusal: one line, the exit code, no output touched.
+  std::string refusal(const std::vector<std::string>& call, int code = 1) const {
+    writeFileAtomically(path("cloud.ply"), "old cloud");
+    writeFileAtomically(path("range.tiff"), "old range");
+    const std::size_t before = entries();
+    const Outcome outcome = run(call);
+    EXPECT_EQ(outcome.code, code) << outcome.err;
+    EXPECT_EQ(outcome.out, "");
+    if (code == 1) {
+      EXPECT_EQ(std::count(outcome.err.begin(), outcome.err.end(), '\n'), 1) << outcome.err;
+    }
+    EXPECT_EQ(readFile(path("cloud.ply")), "old cloud");
+    EXPECT_EQ(readFile(path("range.tiff")), "old range");
+    EXPECT_EQ(entries(), before);
+    return outcome.err;
+  }
+
+  std::size_t entries() const {
+    return std::distance(fs::directory_iterator(folder_), fs::directory_iterator());
+  }
+
+  fs::path folder_;
+  cv::Mat reference_, displaced_;
+};
+
+TEST_F(StereoCommand, WritesCloudRangeAndJson) {
+  const Outcome outcome = run(arguments({}, {"--json", "--threads", "1"}));
+  ASSERT_EQ(outcome.code, 0) << outcome.err;
+  EXPECT_EQ(outcome.err, "");
+  EXPECT_EQ(std::count(outcome.out.begin(), outcome.out.end(), '\n'), 1);
+  const auto json = nlohmann::json::parse(outcome.out);
+  EXPECT_GT(json["valid_fraction"].get<double>(), 0.7);
+  EXPECT_LE(json["valid_fraction"].get<double>(), 1.0);
+  EXPECT_GT(json["seconds"]["total"].get<double>(), 0.0);
+  EXPECT_GE(json["seconds"]["setup"].get<double>(), 0.0);
+  EXPECT_GE(json["working_memory_mb"].get<double>(), 0.0);
+  EXPECT_GT(json["peak_memory_mb"].get<double>(), 5.0);
+  EXPECT_NEAR(json["baseline_m"].get<double>(), 0.3, 1e-12);
+
+  const cv::Mat range = cv::imread(path("range.tiff"), cv::IMREAD_UNCHANGED);
+  ASSERT_EQ(range.type(), CV_32FC1);
+  const Cloud cloud = readCloud(path("cloud.ply"));
+  ASSERT_EQ(cloud.xyz.size(), range.size());
+  int valid = 0, on_wall = 0;
+  for (int v = 0; v < range.rows; ++v) {
+    for (int u = 0; u < range.cols; ++u) {
+      const auto& p = cloud.xyz.at<cv::Vec3f>(v, u);
+      ASSERT_EQ(std::isnan(range.at<float>(v, u)), std::isnan(p[0]));
+      if (std::isnan(p[0])) continue;
+      ++valid;
+      EXPECT_NEAR(cv::norm(p), range.at<float>(v, u), 1e-5 * cv::norm(p));
+      on_wall += std::abs(p[2] - 2.0) < 0.1;
+      EXPECT_EQ(cloud.bgr.at<cv::Vec3b>(v, u), cv::Vec3b::all(reference_.at<uchar>(v, u)));
+    }
+  }
+  EXPECT_EQ(valid, json["valid"].get<int>());
+  EXPECT_GT(on_wall, 0.9 * valid);
+
+  const Outcome plane = run({"evaluate", "plane", "--cloud", path("cloud.ply"), "--truth-height",
+                             "2", "--json", "--roi", "20,20,80,60"});
+  ASSERT_EQ(plane.code, 0) << plane.err;
+  const auto fit = nlohmann::json::parse(plane.out);
+  EXPECT_NEAR(fit["distance_m"].get<double>(), 2.0, 0.01);
+  EXPECT_NEAR(fit["normal"][2].get<double>(), -1.0, 0.001);
+  EXPECT_LT(fit["median_range_error"].get<double>(), 0.01);
+  EXPECT_GT(fit["density"].get<double>(), 0.95);
+  EXPECT_FALSE(fit["bands"].empty());
+}
+
+TEST_F(StereoCommand, SweepIsTheDefaultAndRepeats) {
+  const Outcome outcome = run(
+      arguments({{"--matcher", ""}, {"--cloud", path("new.pcd")}}, {"--json", "--repeat", "3"}));
+  ASSERT_EQ(outcome.code, 0) << outcome.err;
+  const auto json = nlohmann::json::parse(outcome.out);
+  EXPECT_EQ(json["matcher"], "sweep");
+  EXPECT_EQ(json["repeat"], 3);
+  EXPECT_GT(json["valid_fraction"].get<double>(), 0.5);
+  EXPECT_THAT(readFile(path("new.pcd")), HasSubstr("HEIGHT 96"));
+}
+
+TEST_F(StereoCommand, TakesAnyDepthAndColour) {
+  const auto rangeOf = [&](const std::map<std::string, std::string>& changed) {
+    const Outcome outcome = run(arguments(changed));
+    EXPECT_EQ(outcome.code, 0) << outcome.err;
+    return cv::imread(path("range.tiff"), cv::IMREAD_UNCHANGED);
+  };
+  const cv::Mat plain = rangeOf({});
+  // Twelve bits in files of sixteen.
+  cv::Mat deep;
+  reference_.convertTo(deep, CV_16U, 4095.0 / 255.0);
+  cv::imwrite(path("reference16.png"), deep);
+  displaced_.convertTo(deep, CV_16U, 4095.0 / 255.0);
+  cv::imwrite(path("displaced16.png"), deep);
+  const cv::Mat from16 =
+      rangeOf({{"--reference", path("reference16.png")}, {"--displaced", path("displaced16.png")}});
+  cv::Mat color;
+  cv::cvtColor(reference_, color, cv::COLOR_GRAY2BGRA);
+  cv::imwrite(path("color.png"), color);
+  const cv::Mat from_color = rangeOf({{"--reference", path("color.png")}});
+  for (const cv::Mat& other : {from16, from_color}) {
+    EXPECT_EQ(0, std::memcmp(plain.data, other.data, plain.total() * 4));
+  }
+}
+
+TEST_F(StereoCommand, AMaskLeavesPixelsOut) {
+  cv::Mat mask(96, 128, CV_8UC1, cv::Scalar(0));
+  mask(cv::Rect(40, 30, 30, 20)) = 1;
+  cv::imwrite(path("mask.png"), mask);
+  const Outcome outcome = run(arguments({{"--mask", path("mask.png")}}, {"--json"}));
+  ASSERT_EQ(outcome.code, 0) << outcome.err;
+  const auto json = nlohmann::json::parse(outcome.out);
+  EXPECT_LE(json["valid"].get<int>(), 600);
+  EXPECT_GT(json["valid_fraction"].get<double>(), 0.9);
+}
+
+TEST_F(StereoCommand, SeveralDisplacedImagesWithTheirPoses) {
+  const Outcome outcome = run(arguments({}, {"--displaced", path("displaced.png"), "--pose", kPose,
+                                             "--lens-displaced", path("lens.yaml"), "--json"}));
+  ASSERT_EQ(outcome.code, 0) << outcome.err;
+  EXPECT_THAT(refusal(arguments({}, {"--displaced", path("displaced.png")})),
+              HasSubstr("2 displaced image(s) but 1 pose(s)"));
+  EXPECT_THAT(refusal(arguments({}, {"--pose", kPose})),
+              HasSubstr("1 displaced image(s) but 2 pose(s)"));
+  EXPECT_THAT(refusal(arguments({{"--pose", ""}})), HasSubstr("0 pose(s)"));
+  EXPECT_THAT(refusal(arguments({}, {"--lens-displaced", path("lens.yaml"), "--lens-displaced",
+                                     path("lens.yaml")})),
+              HasSubstr("2 lenses"));
+}
+
+TEST_F(StereoCommand, RefusesBadInputAndTouchesNothing) {
+  cv::imwrite(path("small.png"), cv::Mat(10, 12, CV_8UC1, cv::Scalar(7)));
+  cv::imwrite(path("float.tiff"), cv::Mat(96, 128, CV_32FC1, cv::Scalar(7)));
+  const std::string png = readFile(path("reference.png"));
+  writeFileAtomically(path("cut.png"), png.substr(0, png.size() / 2));
+  writeFileAtomically(path("text.png"), "not an image");
+  EXPECT_THAT(refusal(arguments({{"--reference", path("absent.png")}})), HasSubstr("absent.png"));
+  EXPECT_THAT(refusal(arguments({{"--displaced", path("absent.png")}})), HasSubstr("absent.png"));
+  EXPECT_THAT(refusal(arguments({{"--reference", path("cut.png")}})), HasSubstr("cut.png"));
+  EXPECT_THAT(refusal(arguments({{"--reference", path("text.png")}})), HasSubstr("text.png"));
+  EXPECT_THAT(refusal(arguments({{"--displaced", path("small.png")}})),
+              AllOf(HasSubstr("small.png"), HasSubstr("12x10"), HasSubstr("lens.yaml"),
+                    HasSubstr("128x96")));
+  EXPECT_THAT(refusal(arguments({{"--mask", path("small.png")}})), HasSubstr("small.png"));
+  EXPECT_THAT(refusal(arguments({{"--reference", path("float.tiff")}})), HasSubstr("8 or 16 bits"));
+  EXPECT_THAT(refusal(arguments({{"--lens", path("reference.png")}})), HasSubstr("reference.png"));
+  EXPECT_THAT(refusal(arguments({{"--lens", path("absent.yaml")}})), HasSubstr("absent.yaml"));
+  EXPECT_THAT(refusal(arguments({{"--pose", "0 0 0 0 0 0 1"}})), HasSubstr("no parallax"));
+  EXPECT_THAT(refusal(arguments({{"--pose", "nan 0 0 0 0 0 1"}})), HasSubstr("--pose"));
+  EXPECT_THAT(refusal(arguments({{"--pose", "0.1 0 0"}})), HasSubstr("--pose"));
+  EXPECT_THAT(refusal(arguments({{"--pose", "0.1 0 0 0 0 0 0"}})), HasSubstr("--pose"));
+  EXPECT_THAT(refusal(arguments({{"--min-range", "nan"}})), HasSubstr("minimum range is nan"));
+  EXPECT_THAT(refusal(arguments({{"--min-range", "3"}, {"--max-range", "2"}})),
+              HasSubstr("not below"));
+  EXPECT_THAT(refusal(arguments({{"--hypotheses", "2000000"}})), HasSubstr("hypotheses"));
+  EXPECT_THAT(refusal(arguments({{"--repeat", "0"}})), HasSubstr("--repeat"));
+  EXPECT_THAT(refusal(arguments({{"--thesis-window", "4"}})), HasSubstr("thesis mask"));
+  // Outputs.
+  EXPECT_THAT(refusal(arguments({{"--cloud", path("cloud.obj")}})), HasSubstr("cloud.obj"));
+  EXPECT_THAT(refusal(arguments({{"--range", path("range.png")}})), HasSubstr("range.png"));
+  EXPECT_THAT(refusal(arguments({{"--cloud", path("absent/cloud.ply")}})), HasSubstr("no folder"));
+  fs::copy(path("reference.png"), path("reference.tiff"));
+  EXPECT_THAT(refusal(arguments(
+                  {{"--reference", path("reference.tiff")}, {"--range", path("reference.tiff")}})),
+              HasSubstr("input and an output at once"));
+  fs::create_directory(path("folder.ply"));
+  EXPECT_THAT(refusal(arguments({{"--cloud", path("folder.ply")}})), HasSubstr("folder.ply"));
+  fs::create_directory(path("folder.tiff"));
+  EXPECT_THAT(refusal(arguments({{"--range", path("folder.tiff")}})), HasSubstr("it is a folder"));
+}
+
+TEST_F(StereoCommand, WrongUsageIsExitCode2) {
+  EXPECT_THAT(refusal({"stereo"}, 2), HasSubstr("required"));
+  EXPECT_THAT(refusal(arguments({{"--matcher", "best"}}), 2), HasSubstr("--matcher"));
+  EXPECT_THAT(refusal(arguments({{"--min-range", "near"}}), 2), HasSubstr("--min-range"));
+  EXPECT_THAT(refusal(arguments({}, {"--frobnicate"}), 2), HasSubstr("frobnicate"));
+  EXPECT_THAT(refusal({"evaluate"}, 2), HasSubstr("subcommand"));
+}
+
+TEST_F(StereoCommand, EvaluateRefusesWhatItCannotRead) {
+  EXPECT_THAT(refusal({"evaluate", "plane", "--cloud", path("cloud.ply")}), HasSubstr("cloud.ply"));
+  EXPECT_EQ(run(arguments()).code, 0);
+  for (const char* roi :
+       {"1,2,3", "0,0,0,5", "0,0,129,5", "a,b,c,d", "-1,0,5,5", "0.5,0,5,5", "nan,0,5,5"}) {
+    const Outcome outcome = run({"evaluate", "plane", "--cloud", path("cloud.ply"), "--roi", roi});
+    EXPECT_EQ(outcome.code, 1) << roi;
+    EXPECT_THAT(outcome.err, HasSubstr("--roi")) << roi;
+  }
+  EXPECT_EQ(run({"evaluate", "plane", "--cloud", path("cloud.ply"), "--truth-height", "nan"}).code,
+            1);
+}
+
+}  // namespace
+}  // namespace omnister
