@@ -26,6 +26,7 @@ void addStereo(CLI::App& app);
 void addEvaluate(CLI::App& app);
 void addRender(CLI::App& app);
 void addDewarp(CLI::App& app);
+void addTarget(CLI::App& app);
 
 namespace {
 
@@ -37,6 +38,7 @@ constexpr AddCommand kCommands[] = {
     addEvaluate,
     addRender,
     addDewarp,
+    addTarget,
     nullptr,
 };
 
