@@ -47,7 +47,7 @@ compare() {
   elif [[ " $* " == *" --size "* ]]; then
     stereo --suite compare "$@"
   else
-    stereo --suite compare --size 1280x960 3060x2036 --thesis-rows 240 "$@"
+    stereo --suite compare --size 1280x960 3060x2036 --thesis-rows 480 "$@"
   fi
 }
 

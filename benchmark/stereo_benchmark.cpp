@@ -43,7 +43,7 @@ struct Settings {
   std::vector<std::string> methods{"sweep", "bm", "3way", "sgbm"};
   int runs = 5;
   int thesis_row = 0;
-  double noise = 1.0;
+  double noise = 0.0;
   std::string out;
 };
 
@@ -361,6 +361,12 @@ void accuracy(const Settings& settings, Json& json) {
   for (const char* name : {"room", "corridor", "weak_texture"}) {
     const StereoCase pair = makeCase(name, *loadScene(settings, name), lens, size, options);
     report(name, pair, sweepRange(pair));
+  }
+  for (const char* name : {"room", "weak_texture"}) {
+    CaseOptions noisy = options;
+    noisy.noise_sigma = 2.0;
+    const StereoCase pair = makeCase(name, *loadScene(settings, name), lens, size, noisy);
+    report(std::string(name) + ", noise of 2 levels", pair, sweepRange(pair));
   }
   {
     const sim::ScenePtr plane = loadScene(settings, "plane");
