@@ -38,13 +38,13 @@ struct Octave {
 };
 
 OMNISTER_CLONES
-void addOctave(const Octave& octave, const float* table, const TextureSamples& samples,
-               float* sum) {
+void addOctave(const Octave& octave, const float* __restrict table, const TextureSamples& samples,
+               float* __restrict sum) {
   const Octave o = octave;
   const int n = samples.n;
-  const float* u = samples.u;
-  const float* v = samples.v;
-  const float* width = samples.width;
+  const float* __restrict u = samples.u;
+  const float* __restrict v = samples.v;
+  const float* __restrict width = samples.width;
   constexpr int kMask = kLattice - 1;
   for (int k = 0; k < n; ++k) {
     const float x = o.x_u * u[k] + o.x_v * v[k] + o.x_0;
