@@ -324,12 +324,12 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
   return layout;
 }
 
-Grid makeGrid(const Layout& layout, const ReferenceMap& map, const EpipolarFrame& frame,
+Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& frame,
               double column_sign_scale, const WideLens& lens, cv::Size full_size, int level,
               const Eigen::Matrix3d& R_ref_disp, int halo, int threads) {
   Grid grid;
   grid.column_scale = column_sign_scale;
-  grid.bands = layout.bands;
+  grid.bands = layout->bands;
   const int scale = 1 << level;
   const int width = (full_size.width + scale - 1) / scale;
   const int height = (full_size.height + scale - 1) / scale;
@@ -340,7 +340,7 @@ Grid makeGrid(const Layout& layout, const ReferenceMap& map, const EpipolarFrame
   std::vector<std::pair<int, int>> row_range(
       grid.bands.size(), {std::numeric_limits<int>::max(), std::numeric_limits<int>::min()});
   const auto visit = [&](const auto& action) {
-    for (const Tile& tile : layout.tiles) {
+    for (const Tile& tile : layout->tiles) {
       if (tile.band < 0) continue;
       const Band& band = grid.bands[tile.band];
       const double to_row = 1.0 / (kPhiUnits * band.step_phi), row0 = -kPi / band.step_phi;
@@ -542,6 +542,35 @@ Grid makeGrid(const Layout& layout, const ReferenceMap& map, const EpipolarFrame
       }
     });
   }
+  // Most tiles see nothing but image, and need not ask.
+  parallelFor(0, layout->tiles.size(), threads, [&](std::size_t t) {
+    Tile& tile = layout->tiles[t];
+    if (tile.band < 0) return;
+    const Band& band = grid.bands[tile.band];
+    int first_row = band.rows, last_row = -1;
+    for (int y = tile.rect.y; y < tile.rect.br().y; ++y) {
+      for (int x = tile.rect.x; x < tile.rect.br().x; ++x) {
+        const std::uint16_t phi = map.phi[static_cast<std::size_t>(y) * map.size.width + x];
+        if (phi == kNoRay) continue;
+        const int row = static_cast<int>(std::lround(phi * band.row_scale + band.row_offset));
+        first_row = std::min(first_row, row);
+        last_row = std::max(last_row, row);
+      }
+    }
+    const double ends[2] = {tile.a_min * column_sign_scale / band.step_h,
+                            tile.a_max * column_sign_scale / band.step_h};
+    const double lowest = std::min(ends[0], ends[1]) + tile.h_min / band.step_h - 2;
+    const double highest = std::max(ends[0], ends[1]) + tile.h_max / band.step_h + 2;
+    bool clear = first_row >= 0 && last_row < band.rows;
+    for (int r = first_row; clear && r <= last_row; ++r) {
+      const int from = static_cast<int>(std::floor(lowest)) - band.begin[r];
+      const int to = static_cast<int>(std::ceil(highest)) - band.begin[r];
+      clear = from >= 0 && to < band.runs[r] * kRun;
+      const std::uint8_t* mask = &grid.mask[(band.origin[r] + band.begin[r]) / kRun];
+      for (int n = from / kRun; clear && n <= to / kRun; ++n) clear = mask[n] == 0xFF;
+    }
+    tile.clear = clear;
+  });
   return grid;
 }
 

@@ -76,6 +76,7 @@ struct Tile {
   int band = -1;               ///< -1: no pixel of it has a ray
   float a_min = 0, a_max = 0;  ///< axis coordinates of its pixels
   float h_min = 0, h_max = 0;  ///< hypotheses worth trying
+  bool clear = false;          ///< every cell it can reach sees the image
 };
 
 /// How a band counts rows and columns.
@@ -127,7 +128,7 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
 
 /// Lays out the cells of one displaced image and finds where they lie in it.
 /// @param column_sign_scale +1 for kAngle; 1 / b of the image for kInverse (negative behind)
-Grid makeGrid(const Layout& layout, const ReferenceMap& map, const EpipolarFrame& frame,
+Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& frame,
               double column_sign_scale, const WideLens& lens, cv::Size full_size, int level,
               const Eigen::Matrix3d& R_ref_disp, int halo, int threads);
 

@@ -7,6 +7,8 @@
 #include <cstring>
 #include <mutex>
 
+#include <hwy/cache_control.h>
+
 #include "sweep_geometry.h"
 
 // The AVX-512 of Ice Lake and Zen 4, with its population count of bytes, is only built when asked
@@ -58,51 +60,101 @@ void HalveRows(const PaddedImage& image, PaddedImage* out, int begin, int end) {
   }
 }
 
+// Vector gathers are slow on many processors: addresses are computed by vectors, memory is read by
+// plain loads, and vectors go on with what was read.
+
 void SampleRow(const PaddedImage& image, const float* x, const float* y, const std::uint8_t* mask,
                int runs, std::uint8_t* grey) {
+  constexpr int kBatch = 32;  // runs
   const hn::CappedTag<std::int32_t, 8> d;
-  const hn::Rebind<std::uint8_t, decltype(d)> d8;
+  const hn::Rebind<std::uint16_t, decltype(d)> d16;
   const int lanes = static_cast<int>(hn::Lanes(d));
-  const auto stride = hn::Set(d, image.stride);
-  const auto* corner = reinterpret_cast<const std::int32_t*>(
-      image.row(0) - PaddedImage::kPad * (static_cast<std::ptrdiff_t>(image.stride) + 1));
-  const auto byte = hn::Set(d, 0xFF);
-  for (int n = 0; n < runs; ++n, grey += 8) {
-    if (mask[n] == 0) {
-      std::memset(grey, 0, 8);
-      continue;
+  const hn::CappedTag<std::int16_t, 32> dv16;
+  const hn::RebindToUnsigned<decltype(dv16)> du16;
+  const hn::Rebind<std::uint8_t, decltype(dv16)> d8;
+  const int lanes16 = static_cast<int>(hn::Lanes(dv16));
+  const std::ptrdiff_t stride = image.stride;
+  const std::uint8_t* corner = image.row(0) - PaddedImage::kPad * (stride + 1);
+  struct Batch {
+    HWY_ALIGN std::int32_t at[kBatch * 8];
+    HWY_ALIGN std::uint16_t fu[kBatch * 8], fv[kBatch * 8];
+  };
+  Batch batches[2];
+  HWY_ALIGN std::uint16_t upper[kBatch * 8], lower[kBatch * 8];
+
+  const auto address = [&](int begin, Batch* batch) {
+    const int count = std::min(kBatch, runs - begin);
+    for (int n = 0; n < count; ++n) {
+      const int run = begin + n;
+      // 16 bits below the point, of which 7 are used, rounded; counted from the corner of the
+      // padding so that all are positive.
+      constexpr float kOne = 65536.0f;
+      const bool seen = mask[run] != 0;
+      const auto u0 =
+          static_cast<std::int32_t>(seen ? (x[run] + PaddedImage::kPad) * kOne + 256.0f : 0.0f);
+      const auto v0 =
+          static_cast<std::int32_t>(seen ? (y[run] + PaddedImage::kPad) * kOne + 256.0f : 0.0f);
+      const auto du = static_cast<std::int32_t>(seen ? (x[run + 1] - x[run]) * (kOne / 8) : 0.0f);
+      const auto dv = static_cast<std::int32_t>(seen ? (y[run + 1] - y[run]) * (kOne / 8) : 0.0f);
+      for (int i = 0; i < 8; i += lanes) {
+        const auto step = hn::Iota(d, i);
+        auto u = hn::Add(hn::Set(d, u0), hn::Mul(step, hn::Set(d, du)));
+        auto v = hn::Add(hn::Set(d, v0), hn::Mul(step, hn::Set(d, dv)));
+        if (mask[run] != 0xFF) {
+          // Cells that the mask leaves out may lie anywhere: they ask for the first pixel.
+          const auto bit = hn::And(hn::Shr(hn::Set(d, mask[run]), step), hn::Set(d, 1));
+          const auto inside = hn::Ne(bit, hn::Zero(d));
+          u = hn::IfThenElseZero(inside, u);
+          v = hn::IfThenElseZero(inside, v);
+        }
+        hn::Store(hn::Add(hn::Mul(hn::ShiftRight<16>(v), hn::Set(d, image.stride)),
+                          hn::ShiftRight<16>(u)),
+                  d, batch->at + n * 8 + i);
+        const auto low = hn::Set(d, 127);
+        hn::Store(hn::DemoteTo(d16, hn::And(hn::ShiftRight<9>(u), low)), d16,
+                  batch->fu + n * 8 + i);
+        hn::Store(hn::DemoteTo(d16, hn::And(hn::ShiftRight<9>(v), low)), d16,
+                  batch->fv + n * 8 + i);
+      }
+      hwy::Prefetch(corner + batch->at[n * 8 + 4]);
+      hwy::Prefetch(corner + batch->at[n * 8 + 4] + stride);
     }
-    // 16 bits below the point, of which 7 are used, rounded; counted from the corner of the padding
-    // so that all are positive.
-    constexpr float kOne = 65536.0f;
-    const auto u0 = static_cast<std::int32_t>((x[n] + PaddedImage::kPad) * kOne + 256.0f);
-    const auto v0 = static_cast<std::int32_t>((y[n] + PaddedImage::kPad) * kOne + 256.0f);
-    const auto du = static_cast<std::int32_t>((x[n + 1] - x[n]) * (kOne / 8));
-    const auto dv = static_cast<std::int32_t>((y[n + 1] - y[n]) * (kOne / 8));
-    for (int i = 0; i < 8; i += lanes) {
-      const auto step = hn::Iota(d, i);
-      // Cells that the mask leaves out may lie anywhere: they ask for the first pixel.
-      const auto bit = hn::And(hn::Shr(hn::Set(d, mask[n]), step), hn::Set(d, 1));
-      const auto inside = hn::Ne(bit, hn::Zero(d));
-      const auto u =
-          hn::IfThenElseZero(inside, hn::Add(hn::Set(d, u0), hn::Mul(step, hn::Set(d, du))));
-      const auto v =
-          hn::IfThenElseZero(inside, hn::Add(hn::Set(d, v0), hn::Mul(step, hn::Set(d, dv))));
-      const auto at = hn::Add(hn::Mul(hn::ShiftRight<16>(v), stride), hn::ShiftRight<16>(u));
-      const auto upper = hn::GatherOffset(d, corner, at);
-      const auto lower = hn::GatherOffset(d, corner, hn::Add(at, stride));
-      const auto fu = hn::And(hn::ShiftRight<9>(u), hn::Set(d, 127));
-      const auto fv = hn::And(hn::ShiftRight<9>(v), hn::Set(d, 127));
-      const auto across = [&](auto pair) {
-        const auto p = hn::And(pair, byte);
-        const auto q = hn::And(hn::ShiftRight<8>(pair), byte);
-        return hn::Add(hn::ShiftLeft<7>(p), hn::Mul(hn::Sub(q, p), fu));
+  };
+
+  address(0, &batches[0]);
+  for (int begin = 0, turn = 0; begin < runs; begin += kBatch, grey += kBatch * 8, turn ^= 1) {
+    if (begin + kBatch < runs) address(begin + kBatch, &batches[turn ^ 1]);
+    const Batch& batch = batches[turn];
+    const int count = std::min(kBatch, runs - begin);
+    for (int i = 0; i < count * 8; ++i) {
+      std::memcpy(&upper[i], corner + batch.at[i], 2);
+      std::memcpy(&lower[i], corner + batch.at[i] + stride, 2);
+    }
+    // The last vectors may go past the batch, into what earlier ones left: it is not used.
+    for (int i = 0; i < count * 8; i += lanes16) {
+      const auto wu = hn::Load(du16, batch.fu + i);
+      const auto across = [&](const std::uint16_t* pairs) {
+        const auto pair = hn::Load(du16, pairs + i);
+        const auto p = hn::And(pair, hn::Set(du16, 0xFF)), q = hn::ShiftRight<8>(pair);
+        return hn::BitCast(dv16, hn::Add(hn::ShiftLeft<7>(p), hn::Mul(hn::Sub(q, p), wu)));
       };
       const auto top = across(upper), bottom = across(lower);
-      const auto sum = hn::Add(hn::ShiftLeft<7>(top), hn::Mul(hn::Sub(bottom, top), fv));
-      const auto value = hn::ShiftRight<14>(hn::Add(sum, hn::Set(d, 8192)));
-      const auto seen = hn::IfThenElseZero(inside, hn::Max(value, hn::Set(d, 1)));
-      hn::StoreU(hn::DemoteTo(d8, seen), d8, grey + i);
+      const auto wv = hn::BitCast(dv16, hn::ShiftLeft<8>(hn::Load(du16, batch.fv + i)));
+      const auto value = hn::Add(top, hn::MulFixedPoint15(hn::Sub(bottom, top), wv));
+      const auto rounded = hn::ShiftRight<7>(hn::Add(value, hn::Set(dv16, 64)));
+      const auto bytes = hn::DemoteTo(d8, hn::Max(rounded, hn::Set(dv16, 1)));
+      if (i + lanes16 <= count * 8) {
+        hn::StoreU(bytes, d8, grey + i);
+      } else {
+        HWY_ALIGN std::uint8_t last[64];
+        hn::StoreU(bytes, d8, last);
+        std::memcpy(grey + i, last, count * 8 - i);
+      }
+    }
+    for (int n = 0; n < count; ++n) {
+      if (mask[begin + n] == 0xFF) continue;
+      for (int i = 0; i < 8; ++i)
+        if (!(mask[begin + n] >> i & 1)) grey[n * 8 + i] = 0;
     }
   }
 }
@@ -217,77 +269,107 @@ HWY_INLINE std::uint16_t LeastLane(D d, V v) {
 #endif
 }
 
-template <int kLanes>
+template <int kLanes, bool kFirst>
 void MatchLanes(const ChunkJob& job) {
-  constexpr int window = kWindow;
-  const int tile_width = job.width - 2 * kRadius;
-  const std::size_t line = static_cast<std::size_t>(job.width) * kLanes;
-  job.scratch->assign(line * (window + 1) + 256, 0);
+  constexpr int kRowWidth = 128;
+  constexpr int kAhead = 3;  // rows
+  const int width = job.width, height = job.height, stride = job.stride;
+  const int tile_width = width - 2 * kRadius;
+  const std::size_t line = static_cast<std::size_t>(width) * kLanes;
+  job.scratch->assign(line * (kWindow + 1) + 256, 0);
   std::uint8_t* HWY_RESTRICT sums = job.scratch->data();
-  std::uint8_t* ring = sums + line;
+  std::uint8_t* const ring = sums + line;
+  // Bytes may alias anything, so what the loops need is copied out of the job.
+  const std::int32_t* HWY_RESTRICT bases = job.base;
+  const std::uint8_t* HWY_RESTRICT reference0 = job.reference[0];
+  const std::uint8_t* HWY_RESTRICT reference1 = job.reference[1];
+  const std::uint8_t* HWY_RESTRICT reference2 = job.reference[2];
+  const std::uint8_t* HWY_RESTRICT cells0 = job.cells[0] + job.first;
+  const std::uint8_t* HWY_RESTRICT cells1 = job.cells[1] + job.first;
+  const std::uint8_t* HWY_RESTRICT cells2 = job.cells[2] + job.first;
 
   const hn::CappedTag<std::uint8_t, kLanes> d8;
   const hn::CappedTag<std::uint16_t, kLanes> d16;
   const hn::Rebind<std::uint8_t, decltype(d16)> d8h;
-  const std::size_t n8 = hn::Lanes(d8), n16 = hn::Lanes(d16);
+  constexpr std::size_t n8 = hn::MaxLanes(decltype(d8)());
+  constexpr std::size_t n16 = hn::MaxLanes(decltype(d16)());
   HWY_ALIGN std::uint16_t lane_index[kLanes];
   for (int i = 0; i < kLanes; ++i)
     lane_index[i] = (i == 0 || i == kLanes - 1) ? 0xFFFF : static_cast<std::uint16_t>(i);
 
-  HWY_ALIGN std::uint16_t box[kLanes];
-  for (int y = 0; y < job.height; ++y) {
-    std::uint8_t* HWY_RESTRICT old = ring + (y % window) * line;
-    const std::size_t row = static_cast<std::size_t>(y) * job.stride;
-    for (int x = 0; x < job.width; ++x) {
+  HWY_ALIGN std::uint16_t boxes[kRowWidth * kLanes];
+  HWY_ALIGN std::uint16_t packed[kRowWidth];
+  for (int y = 0; y < height; ++y) {
+    std::uint8_t* HWY_RESTRICT old = ring + static_cast<std::size_t>(y % kWindow) * line;
+    const std::size_t row = static_cast<std::size_t>(y) * stride;
+    if (y + kAhead < height) {
+      // Cells of rows to come: the processor does not see these leaps coming.
+      for (int x = 0; x < width; x += 32) {
+        const std::ptrdiff_t base = bases[row + static_cast<std::size_t>(kAhead) * stride + x];
+        hwy::Prefetch(cells0 + base);
+        hwy::Prefetch(cells1 + base);
+        hwy::Prefetch(cells2 + base);
+      }
+    }
+    for (int x = 0; x < width; ++x) {
       const std::size_t pixel = row + x;
-      // Where there is no ray, and in a stray halo, any cell will do.
-      const std::int32_t base = std::min(std::max(job.base[pixel] + job.first, 0), job.cells_end);
+      const std::ptrdiff_t base = bases[pixel];
       for (std::size_t l = 0; l < kLanes; l += n8) {
-        auto cost = hn::PopulationCount(
-            hn::Xor(hn::LoadU(d8, job.cells[0] + base + l), hn::Set(d8, job.reference[0][pixel])));
-        for (int p = 1; p < kPlanes; ++p) {
-          cost = hn::Add(cost, hn::PopulationCount(hn::Xor(hn::LoadU(d8, job.cells[p] + base + l),
-                                                           hn::Set(d8, job.reference[p][pixel]))));
-        }
+        const auto cost0 = hn::PopulationCount(
+            hn::Xor(hn::LoadU(d8, cells0 + base + l), hn::Set(d8, reference0[pixel])));
+        const auto cost1 = hn::PopulationCount(
+            hn::Xor(hn::LoadU(d8, cells1 + base + l), hn::Set(d8, reference1[pixel])));
+        const auto cost2 = hn::PopulationCount(
+            hn::Xor(hn::LoadU(d8, cells2 + base + l), hn::Set(d8, reference2[pixel])));
+        const auto cost = hn::Add(hn::Add(cost0, cost1), cost2);
         const std::size_t at = static_cast<std::size_t>(x) * kLanes + l;
         const auto sum = hn::LoadU(d8, sums + at);
         hn::StoreU(hn::Add(sum, hn::Sub(cost, hn::LoadU(d8, old + at))), d8, sums + at);
         hn::StoreU(cost, d8, old + at);
       }
     }
-    if (y < window - 1) continue;
-    const std::size_t out = static_cast<std::size_t>(y - window + 1) * tile_width;
-    std::memset(box, 0, sizeof box);
-    for (int x = 0; x < job.width; ++x) {
-      const std::uint8_t* HWY_RESTRICT in = sums + static_cast<std::size_t>(x) * kLanes;
-      const std::uint8_t* HWY_RESTRICT gone = in - static_cast<std::ptrdiff_t>(window) * kLanes;
-      auto least = hn::Set(d16, std::uint16_t{0xFFFF});
-      for (std::size_t l = 0; l < kLanes; l += n16) {
-        auto sum = hn::Add(hn::Load(d16, box + l), hn::PromoteTo(d16, hn::LoadU(d8h, in + l)));
-        if (x >= window) sum = hn::Sub(sum, hn::PromoteTo(d16, hn::LoadU(d8h, gone + l)));
-        hn::Store(sum, d16, box + l);
-        least = hn::Min(least, hn::Or(hn::ShiftLeft<5>(sum), hn::Load(d16, lane_index + l)));
+    if (y < kWindow - 1) continue;
+    for (std::size_t l = 0; l < kLanes; l += n16) {
+      const auto index = hn::Load(d16, lane_index + l);
+      auto sum = hn::Zero(d16);
+      for (int x = 0; x < kWindow - 1; ++x)
+        sum = hn::Add(sum, hn::PromoteTo(d16, hn::LoadU(d8h, sums + x * kLanes + l)));
+      for (int x = 0; x < tile_width; ++x) {
+        const std::uint8_t* HWY_RESTRICT gone = sums + static_cast<std::size_t>(x) * kLanes + l;
+        sum = hn::Add(sum, hn::PromoteTo(d16, hn::LoadU(d8h, gone + (kWindow - 1) * kLanes)));
+        hn::Store(sum, d16, boxes + static_cast<std::size_t>(x) * kLanes + l);
+        const std::uint16_t least = LeastLane(d16, hn::Or(hn::ShiftLeft<5>(sum), index));
+        packed[x] = l == 0 ? least : std::min(packed[x], least);
+        sum = hn::Sub(sum, hn::PromoteTo(d16, hn::LoadU(d8h, gone)));
       }
-      if (x < window - 1) continue;
-      const std::uint16_t packed = LeastLane(d16, least);
-      const std::uint16_t cost = packed >> 5;
-      const std::size_t pixel = out + x - window + 1;
-      if (cost < job.cost[pixel]) {
-        const int lane = packed & 31;
-        job.cost[pixel] = cost;
-        job.index[pixel] = static_cast<std::int16_t>(job.first + lane);
-        job.before[pixel] = box[lane - 1];
-        job.after[pixel] = box[lane + 1];
-      }
+    }
+    const std::size_t out = static_cast<std::size_t>(y - kWindow + 1) * tile_width;
+    std::uint16_t* HWY_RESTRICT cost = job.cost + out;
+    std::int16_t* HWY_RESTRICT index = job.index + out;
+    std::uint16_t* HWY_RESTRICT before = job.before + out;
+    std::uint16_t* HWY_RESTRICT after = job.after + out;
+    const int first = job.first;
+    for (int x = 0; x < tile_width; ++x) {
+      const std::uint16_t c = packed[x] >> 5;
+      if (!kFirst && c >= cost[x]) continue;
+      const int lane = packed[x] & 31;
+      cost[x] = c;
+      index[x] = static_cast<std::int16_t>(first + lane);
+      before[x] = boxes[x * kLanes + lane - 1];
+      after[x] = boxes[x * kLanes + lane + 1];
     }
   }
 }
 
 void MatchChunk(const ChunkJob& job) {
-  if (job.lanes == 16)
-    MatchLanes<16>(job);
+  if (job.lanes == 16 && job.fresh)
+    MatchLanes<16, true>(job);
+  else if (job.lanes == 16)
+    MatchLanes<16, false>(job);
+  else if (job.fresh)
+    MatchLanes<32, true>(job);
   else
-    MatchLanes<32>(job);
+    MatchLanes<32, false>(job);
 }
 
 // Polynomials in place of the library's functions: the same bits whatever the instruction set.
@@ -325,11 +407,13 @@ void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
   const hn::RebindToSigned<decltype(df)> di;
   const hn::Rebind<std::uint16_t, decltype(df)> du16;
   const int lanes = static_cast<int>(hn::Lanes(df));
+  const std::int32_t* HWY_RESTRICT origin = job.origin;
+  HWY_ALIGN std::int32_t rows[HWY_MAX_BYTES / 4];
   for (int x = 0; x < count; x += lanes) {
     const auto p = hn::PromoteTo(di, hn::LoadU(du16, phi + x));
     const auto row = hn::NearestInt(hn::Add(
         hn::Mul(hn::ConvertTo(df, p), hn::Set(df, job.row_scale)), hn::Set(df, job.row_offset)));
-    const auto inside = hn::Min(hn::Max(row, hn::Zero(di)), hn::Set(di, job.rows - 1));
+    hn::Store(hn::Min(hn::Max(row, hn::Zero(di)), hn::Set(di, job.rows - 1)), di, rows);
     const auto slope = hn::Mul(hn::ConvertTo(df, hn::Iota(di, x)), hn::Set(df, job.guess_x));
     const auto column = hn::Add(hn::Mul(hn::LoadU(df, a + x), hn::Set(df, job.to_column)),
                                 hn::Add(slope, hn::Set(df, job.guess)));
@@ -340,10 +424,13 @@ void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
                                 hn::Set(df, job.dither / 256.0f));
     const auto whole = hn::NearestInt(hn::Add(column, dither));
     const auto none = hn::Eq(p, hn::Set(di, kNoRay));
-    const auto cell = hn::Add(hn::GatherIndex(di, job.origin, inside), whole);
-    hn::StoreU(hn::IfThenElse(none, hn::Set(di, -1), cell), di, base + x);
     const auto gap = hn::Sub(hn::ConvertTo(df, whole), column);
     hn::StoreU(hn::IfThenZeroElse(hn::RebindMask(df, none), gap), df, residual + x);
+    for (int i = 0; i < lanes; ++i) rows[i] = origin[rows[i]];
+    // Where there is no ray, and in a stray halo, any cell will do.
+    const auto cell =
+        hn::Min(hn::Max(hn::Add(hn::Load(di, rows), whole), hn::Zero(di)), hn::Set(di, job.cells));
+    hn::StoreU(hn::IfThenZeroElse(none, cell), di, base + x);
   }
 }
 
@@ -374,6 +461,7 @@ void ConcludeRow(ConcludeJob* in_out) {
   const auto load = [&](const std::uint16_t* p) {
     return hn::ConvertTo(df, hn::PromoteTo(di, hn::LoadU(du16, p)));
   };
+  HWY_ALIGN std::int32_t words[HWY_MAX_BYTES / 4];
   auto first = hn::Set(di, job.claim_first), last = hn::Set(di, job.claim_last);
   for (int x = 0; x < job.count; x += lanes) {
     const auto c = load(job.cost + x), before = load(job.before + x), after = load(job.after + x);
@@ -381,14 +469,17 @@ void ConcludeRow(ConcludeJob* in_out) {
     const auto steep = hn::Sub(hn::Max(before, after), c);
     const auto cell = hn::Add(hn::LoadU(di, job.base + x), k);
     const auto phi = hn::PromoteTo(di, hn::LoadU(du16, job.phi + x));
-    const auto legal = hn::And(hn::Gt(cell, hn::Set(di, -1)), hn::Lt(cell, hn::Set(di, job.cells)));
-    const auto safe = hn::IfThenElseZero(legal, cell);
-    // The mask bit of the cell; four bytes are read, the lowest counts.
-    const auto word = hn::GatherOffset(di, reinterpret_cast<const std::int32_t*>(job.mask),
-                                       hn::ShiftRight<3>(safe));
-    const auto bit = hn::And(hn::Shr(word, hn::And(safe, hn::Set(di, 7))), hn::Set(di, 1));
-    auto good = hn::And(legal, hn::Eq(bit, hn::Set(di, 1)));
-    good = hn::And(good, hn::Ne(phi, hn::Set(di, kNoRay)));
+    auto good = hn::Ne(phi, hn::Set(di, kNoRay));
+    if (job.mask) {
+      const auto legal =
+          hn::And(hn::Gt(cell, hn::Set(di, -1)), hn::Lt(cell, hn::Set(di, job.cells)));
+      const auto safe = hn::IfThenElseZero(legal, cell);
+      hn::Store(safe, di, words);
+      for (int i = 0; i < lanes; ++i) words[i] = job.mask[words[i] >> 3];
+      const auto bit =
+          hn::And(hn::Shr(hn::Load(di, words), hn::And(safe, hn::Set(di, 7))), hn::Set(di, 1));
+      good = hn::And(good, hn::And(legal, hn::Eq(bit, hn::Set(di, 1))));
+    }
     auto fine = hn::And(hn::RebindMask(df, good), hn::Gt(steep, hn::Zero(df)));
     fine = hn::And(fine, hn::Le(c, hn::Set(df, job.worst_cost)));
     // The pixels of a window fall between columns, each elsewhere: their sum is rounder than two
@@ -423,6 +514,10 @@ void ConcludeRow(ConcludeJob* in_out) {
       const auto counted =
           hn::And(hn::RebindMask(di, fine), hn::Lt(hn::Iota(di, x), hn::Set(di, job.count)));
       hn::StoreU(hn::IfThenElse(counted, at, hn::Set(di, -1)), di, job.claim + x);
+      const auto units = hn::NearestInt(
+          hn::Add(hn::Mul(h, hn::Set(df, job.claim_units)), hn::Set(df, kClaimOffset)));
+      const auto low = hn::Min(hn::Max(units, hn::Zero(di)), hn::Set(di, 0x7FFF));
+      hn::StoreU(hn::Or(hn::ShiftLeft<16>(hn::ConvertTo(di, c)), low), di, job.value + x);
       first = hn::Min(first, hn::IfThenElse(counted, row, first));
       last = hn::Max(last, hn::IfThenElse(counted, row, last));
     }
@@ -431,24 +526,25 @@ void ConcludeRow(ConcludeJob* in_out) {
   job.claim_last = hn::GetLane(hn::MaxOfLanes(di, last));
 }
 
-std::size_t CheckRow(const std::uint32_t* claims, const std::int32_t* claim, float to_units,
-                     float tolerance, float* h, int count) {
+std::size_t CheckRow(const std::int32_t* claims, const std::int32_t* claim,
+                     const std::int32_t* value, int tolerance, float* h, int count) {
   const hn::ScalableTag<float> df;
   const hn::RebindToSigned<decltype(df)> di;
   const int lanes = static_cast<int>(hn::Lanes(df));
+  HWY_ALIGN std::int32_t found[HWY_MAX_BYTES / 4];
   std::size_t gone = 0;
   for (int x = 0; x < count; x += lanes) {
     const auto at = hn::LoadU(di, claim + x);
-    const auto some = hn::Gt(at, hn::Set(di, -1));
-    const auto value = hn::LoadU(df, h + x);
-    const auto found = hn::GatherIndex(di, reinterpret_cast<const std::int32_t*>(claims),
-                                       hn::IfThenElseZero(some, at));
-    const auto theirs = hn::ConvertTo(df, hn::And(found, hn::Set(di, 0xFFFF)));
-    const auto mine = hn::Add(hn::Mul(value, hn::Set(df, to_units)), hn::Set(df, kClaimOffset));
-    const auto lost = hn::And(hn::RebindMask(df, some),
-                              hn::Gt(hn::Abs(hn::Sub(mine, theirs)), hn::Set(df, tolerance)));
-    hn::StoreU(hn::IfThenElse(lost, hn::NaN(df), value), df, h + x);
-    gone += hn::CountTrue(df, lost);
+    hn::Store(hn::Max(at, hn::Zero(di)), di, found);
+    for (int i = 0; i < lanes; ++i) found[i] = claims[found[i]];
+    const auto low = hn::Set(di, 0xFFFF);
+    const auto theirs = hn::And(hn::Load(di, found), low);
+    const auto mine = hn::And(hn::LoadU(di, value + x), low);
+    const auto lost = hn::And(hn::Gt(at, hn::Set(di, -1)),
+                              hn::Gt(hn::Abs(hn::Sub(mine, theirs)), hn::Set(di, tolerance)));
+    const auto lost_f = hn::RebindMask(df, lost);
+    hn::StoreU(hn::IfThenElse(lost_f, hn::NaN(df), hn::LoadU(df, h + x)), df, h + x);
+    gone += hn::CountTrue(df, lost_f);
   }
   return gone;
 }
@@ -505,7 +601,7 @@ void TriangulateRow(TriangulateJob* job) {
     const auto in = hn::RebindMask(d, hn::Lt(hn::Iota(di, x), hn::Set(di, job->count)));
     const auto h = hn::LoadU(d, job->h + x), a = hn::LoadU(d, job->a + x);
     const auto known = hn::And(in, hn::Not(hn::IsNaN(h)));
-    const auto cost = load(job->cost + x);
+    const auto cost = hn::ConvertTo(d, hn::ShiftRight<16>(hn::LoadU(di, job->value + x)));
     const auto steep = hn::Max(load(job->steep + x), hn::Set(d, 1.0f));
     const auto one = hn::Set(d, 1.0f);
     // Spread of the least: noise of the costs over the slope beside it.
@@ -628,9 +724,9 @@ void boxMeanRow(const float* in, int stride, int count, float* line, float* out)
 
 void concludeRow(ConcludeJob* job) { HWY_DYNAMIC_DISPATCH(ConcludeRow)(job); }
 
-std::size_t checkRow(const std::uint32_t* claims, const std::int32_t* claim, float to_units,
-                     float tolerance, float* h, int count) {
-  return HWY_DYNAMIC_DISPATCH(CheckRow)(claims, claim, to_units, tolerance, h, count);
+std::size_t checkRow(const std::int32_t* claims, const std::int32_t* claim,
+                     const std::int32_t* value, int tolerance, float* h, int count) {
+  return HWY_DYNAMIC_DISPATCH(CheckRow)(claims, claim, value, tolerance, h, count);
 }
 
 void medianRow(const float* const rows[3], int count, float* out) {

@@ -45,8 +45,8 @@ struct ChunkJob {
   int stride = 0;
   int lanes = 32;  ///< hypotheses tried: 16 or 32; the outer two only serve as neighbours
   const std::int32_t* base = nullptr;  ///< cell of hypothesis 0, by pixel
-  int first = 0;                       ///< hypothesis of lane 0
-  std::int32_t cells_end = 0;          ///< cells at or behind it are not asked for
+  int first = 0;       ///< hypothesis of lane 0; cells from base + first on must be readable
+  bool fresh = false;  ///< nothing was tried before: the state is written without a look
   const std::uint8_t* reference[kPlanes] = {};
   const std::uint8_t* cells[kPlanes] = {};
   /// State by pixel of the tile without halo, `width - 2 kRadius` a row; a chunk replaces it where
@@ -95,6 +95,7 @@ struct MapJob {
   float row_scale = 0, row_offset = 0;
   int rows = 0;
   const std::int32_t* origin = nullptr;  ///< by row
+  std::int32_t cells = 0;                ///< base is held to [0, cells]
   float to_column = 0;
   /// Columns by which rounding is spread out, 0 or 1, and the row's phase in the pattern [1/256].
   float dither = 0;
@@ -102,7 +103,7 @@ struct MapJob {
 
   float guess = 0, guess_x = 0;  ///< expected hypothesis [columns], and its change a pixel
 };
-/// @param base [out] cell, -1 where there is no ray
+/// @param base [out] cell; 0 where there is no ray
 /// @param residual [out] whole column less exact column; 0 where there is no ray
 void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int count,
             std::int32_t* base, float* residual);
@@ -122,7 +123,7 @@ struct ConcludeJob {
   const float* residual = nullptr;     ///< mean over the window, by pixel
   const std::uint16_t* phi = nullptr;
   const float* a = nullptr;
-  const std::uint8_t* mask = nullptr;  ///< of the grid
+  const std::uint8_t* mask = nullptr;  ///< of the grid; null where all cells see the image
   std::int32_t cells = 0;
   float step_h = 0;
   float guess = 0, guess_x = 0;  ///< as in MapJob, from the row's first pixel
@@ -132,18 +133,19 @@ struct ConcludeJob {
   // Where the match falls on the claims image; skipped when claim is null.
   float claim_x = 0, claim_y = 0, claim_y_offset = 0;
   int claim_width = 0, claim_height = 0;
-  std::int32_t* claim = nullptr;                          ///< [out] -1 where nothing was found
+  std::int32_t* claim = nullptr;  ///< [out] -1 where nothing was found
+  float claim_units = 0;          ///< claims count hypotheses in units of 1 / claim_units
+  std::int32_t* value = nullptr;  ///< [out] what is claimed: cost << 16 | hypothesis
   std::int32_t claim_first = INT32_MAX, claim_last = -1;  ///< [in, out] rows of it, widened
 };
 void concludeRow(ConcludeJob* job);
 
-/// Makes NaN of hypotheses whose claim went to another by more than `tolerance` (in units of
-/// claims).
+/// Makes NaN of hypotheses whose claim went to another that differs by more than `tolerance` units.
 /// @return how many
-std::size_t checkRow(const std::uint32_t* claims, const std::int32_t* claim, float to_units,
-                     float tolerance, float* h, int count);
+std::size_t checkRow(const std::int32_t* claims, const std::int32_t* claim,
+                     const std::int32_t* value, int tolerance, float* h, int count);
 
-/// A hypothesis as the low half of a claim.
+/// Added to a hypothesis in a claim, so that small negative ones can be told.
 inline constexpr float kClaimOffset = 64.0f;
 
 /// Median of 3x3 where the middle is valid, neighbours that are not counting as the middle.
@@ -156,7 +158,7 @@ struct TriangulateJob {
   float baseline = 0;    ///< [m]
   const float* a = nullptr;
   const float* h = nullptr;
-  const std::uint16_t* cost = nullptr;
+  const std::int32_t* value = nullptr;  ///< of concludeRow()
   const std::uint16_t* steep = nullptr;
   float step_h = 0;
   float min_range = 0, max_range = 0;

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/stereo/sweep_matcher.h"
 
+#include <hwy/cache_control.h>
 #include <tbb/enumerable_thread_specific.h>
 
 #include <algorithm>
@@ -26,6 +27,7 @@ constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 constexpr float kFullCost = kWindow * kWindow * kBits;  ///< every bit of every descriptor wrong
 constexpr int kNarrowLanes = 14;                        ///< hypotheses of the cheapest chunk
 constexpr int kSearchMargin = 3;      ///< columns beyond what the coarser level found
+constexpr int kClaimTolerance = 6;    ///< quarters of a column that two claims may differ by
 constexpr int kSpeckle = 100;         ///< regions of fewer pixels go
 constexpr float kWorstShare = 0.36f;  ///< of it, that a match may cost; chance gives a half
 
@@ -50,7 +52,8 @@ struct Level {
   Grid grid;
   PaddedImage reference, displaced;
   std::vector<std::uint8_t> cells[kPlanes];
-  cv::Mat h;  ///< CV_32FC1, hypotheses found
+  int slack = 0;  ///< cells before the first and behind the last, for stray reads
+  cv::Mat h;      ///< CV_32FC1, hypotheses found
 };
 
 /// What the next coarser level says of a tile: a plane of hypotheses through it, and how far from
@@ -105,10 +108,16 @@ class SweepMatcher : public Matcher {
       level.map = makeReferenceMap(reference_lens, geometry.reference_size, l, frame_, limits.axis,
                                    options.mask, options.threads);
       level.layout = makeLayout(level.map, limits, cv::Size(64, 48));
-      level.grid = makeGrid(level.layout, level.map, frame_, 1.0, displaced_lens, displaced.size, l,
-                            displaced.T_ref_disp.linear(), kRadius, options.threads);
+      level.grid = makeGrid(&level.layout, level.map, frame_, 1.0, displaced_lens, displaced.size,
+                            l, displaced.T_ref_disp.linear(), kRadius, options.threads);
       limits.hypotheses = (limits.hypotheses + 1) / 2;
-      for (auto& plane : level.cells) plane.resize(level.grid.cells + kCellSlack);
+      level.slack = 2 * kCellSlack;
+      for (const Tile& tile : level.layout.tiles) {
+        if (tile.band < 0) continue;
+        const double step = level.layout.bands[tile.band].step_h;
+        level.slack = std::max(level.slack, static_cast<int>(2 * tile.h_max / step) + kCellSlack);
+      }
+      for (auto& plane : level.cells) plane.resize(level.grid.cells + 2 * level.slack);
       const auto reduced = [l](cv::Size size) {
         return cv::Size((size.width + (1 << l) - 1) >> l, (size.height + (1 << l) - 1) >> l);
       };
@@ -147,7 +156,7 @@ class SweepMatcher : public Matcher {
   void prepareClaims() {
     const Level& level = levels_.front();
     const cv::Size size = level.map.size;
-    cost_ = makePlane(size, CV_16UC1);
+    value_ = makePlane(size, CV_32SC1);
     steep_ = makePlane(size, CV_16UC1);
     claim_ = makePlane(size, CV_32SC1);
     smooth_ = makePlane(size, CV_32FC1);
@@ -222,7 +231,7 @@ class SweepMatcher : public Matcher {
           for (int k = 0; k < 5; ++k) rows[k] = greyRow(r + k - 2) + band.begin[r] - lo;
           std::uint8_t* out[kPlanes];
           for (int p = 0; p < kPlanes; ++p)
-            out[p] = &level->cells[p][band.origin[r] + band.begin[r]];
+            out[p] = &level->cells[p][level->slack + band.origin[r] + band.begin[r]];
           censusRow(rows, band.runs[r] * 8, out);
         }
       });
@@ -344,6 +353,7 @@ class SweepMatcher : public Matcher {
     map_job.row_offset = static_cast<float>(band.row_offset);
     map_job.rows = band.rows;
     map_job.origin = band.origin.data();
+    map_job.cells = level.grid.cells;
     map_job.to_column = static_cast<float>(level.grid.column_scale / band.step_h);
     const int x0 = rect.x - kRadius;
     const bool whole = x0 >= 0 && x0 + width <= map.size.width;
@@ -359,6 +369,11 @@ class SweepMatcher : public Matcher {
       if (whole) {
         phi += x0;
         a += x0;
+        const std::ptrdiff_t ahead = 4 * static_cast<std::ptrdiff_t>(map.size.width);
+        if (v + 4 < map.size.height) {
+          for (int x = 0; x < width; x += 16) hwy::Prefetch(a + ahead + x);
+          for (int x = 0; x < width; x += 32) hwy::Prefetch(phi + ahead + x);
+        }
       } else {
         for (int x = 0; x < width; ++x) {
           const int u = std::clamp(x0 + x, 0, map.size.width - 1);
@@ -381,30 +396,32 @@ class SweepMatcher : public Matcher {
     describeTile(l, tile, band, stride, scratch);
 
     const std::size_t inner = rect.area() + 64;
-    scratch->cost.assign(inner, 0xFFFF);
-    scratch->index.assign(inner, 0);
-    scratch->before.assign(inner, 0);
-    scratch->after.assign(inner, 0);
+    scratch->cost.resize(inner);
+    scratch->index.resize(inner);
+    scratch->before.resize(inner);
+    scratch->after.resize(inner);
     ChunkJob job;
     job.width = width;
     job.height = height;
     job.stride = stride;
 
     job.base = scratch->base.data();
-    job.cells_end = level.grid.cells;
+
     for (int p = 0; p < kPlanes; ++p) {
       job.reference[p] = scratch->reference[p].data();
-      job.cells[p] = level.cells[p].data();
+      job.cells[p] = level.cells[p].data() + level.slack;
     }
     job.cost = scratch->cost.data();
     job.index = scratch->index.data();
     job.before = scratch->before.data();
     job.after = scratch->after.data();
     job.scratch = &scratch->costs;
+    job.fresh = true;
     for (const auto& [from, to] : guess.intervals) {
       for (job.first = from - 1; job.first < to; job.first += job.lanes - 2) {
         job.lanes = to - job.first < 15 ? 16 : 32;
         matchChunk(job);
+        job.fresh = false;
       }
     }
     concludeTile(l, t, stride, scratch);
@@ -497,12 +514,13 @@ class SweepMatcher : public Matcher {
     ConcludeJob job;
     job.count = rect.width;
     job.residual = scratch->residual_mean.data();
-    job.mask = level.grid.mask.data();
+    job.mask = tile.clear ? nullptr : level.grid.mask.data();
     job.cells = level.grid.cells;
     job.step_h = static_cast<float>(band.step_h);
     const Guess& guess = scratch->guess;
     job.guess_x = guess.x;
     job.worst_cost = kWorstShare * kFullCost;
+    job.claim_units = 4 / finest_step_;
     job.claim_x = claim_x_;
     job.claim_y = claim_x_;
     job.claim_y_offset = claim_y_offset_;
@@ -525,9 +543,17 @@ class SweepMatcher : public Matcher {
       if (l == 0) {
         job.steep = steep_.ptr<std::uint16_t>(rect.y + y) + rect.x;
         job.claim = claim_.ptr<std::int32_t>(rect.y + y) + rect.x;
-        std::copy(job.cost, job.cost + rect.width, cost_.ptr<std::uint16_t>(rect.y + y) + rect.x);
+        job.value = value_.ptr<std::int32_t>(rect.y + y) + rect.x;
       }
       job.guess = guess.at + guess.y * static_cast<float>(y);
+      if (y + 2 < rect.height) {
+        for (int x = 0; x < rect.width; x += 16) {
+          __builtin_prefetch(job.h + 2 * level.h.step1() + x, 1);
+          if (l > 0) continue;
+          __builtin_prefetch(job.value + 2 * value_.step1() + x, 1);
+          __builtin_prefetch(job.claim + 2 * claim_.step1() + x, 1);
+        }
+      }
       concludeRow(&job);
     }
     if (l > 0) return;
@@ -539,26 +565,21 @@ class SweepMatcher : public Matcher {
     Level& level = levels_.front();
     constexpr int kStrip = 160;
     const int strips = (claim_size_.height + kStrip - 1) / kStrip;
-    const float to_units = 4 / finest_step_;
     parallelFor(0, strips, options_.threads, [&](std::size_t s) {
       const int begin = static_cast<int>(s) * kStrip;
       const int end = std::min(begin + kStrip, claim_size_.height);
       const std::int32_t first = begin * claim_size_.width, last = end * claim_size_.width;
-      std::fill(claims_.begin() + first, claims_.begin() + last, 0xFFFFFFFFu);
+      std::int32_t* claims = claims_.data();
+      std::fill(claims + first, claims + last, std::numeric_limits<std::int32_t>::max());
       for (std::size_t t = 0; t < level.layout.tiles.size(); ++t) {
         if (claim_rows_[t].second < begin || claim_rows_[t].first >= end) continue;
         const cv::Rect& rect = level.layout.tiles[t].rect;
         for (int y = rect.y; y < rect.br().y; ++y) {
           const std::int32_t* claim = claim_.ptr<std::int32_t>(y);
-          const float* h = level.h.ptr<float>(y);
-          const std::uint16_t* cost = cost_.ptr<std::uint16_t>(y);
+          const std::int32_t* value = value_.ptr<std::int32_t>(y);
           for (int x = rect.x; x < rect.br().x; ++x) {
-            if (claim[x] < first || claim[x] >= last) continue;
-            const int units =
-                std::clamp(static_cast<int>(h[x] * to_units + kClaimOffset + 0.5f), 0, 0xFFFF);
-            std::uint32_t& best = claims_[claim[x]];
-            best = std::min(best, static_cast<std::uint32_t>(cost[x]) << 16 |
-                                      static_cast<std::uint32_t>(units));
+            if (claim[x] >= first && claim[x] < last)
+              claims[claim[x]] = std::min(claims[claim[x]], value[x]);
           }
         }
       }
@@ -587,7 +608,8 @@ class SweepMatcher : public Matcher {
         float* h = level.h.ptr<float>(y);
         matched[s] += width - std::count(claim, claim + width, -1);
         std::fill(h + width, h + width + 64, kNaN);
-        lost[s] += checkRow(claims_.data(), claim, 4 / finest_step_, 6.0f, h, width);
+        lost[s] +=
+            checkRow(claims_.data(), claim, value_.ptr<std::int32_t>(y), kClaimTolerance, h, width);
       }
     });
     watch->lap("check");
@@ -608,9 +630,13 @@ class SweepMatcher : public Matcher {
     rejected["speckle"] = removeSpeckles(&smooth_, finest_step_, kSpeckle, options_.threads);
     watch->lap("speckle");
 
-    result->range.create(height, width, CV_32FC1);
-    result->sigma.create(height, width, CV_32FC1);
-    result->score.create(height, width, CV_32FC1);
+    // Planes that nobody holds any more are used again: fresh memory costs a millisecond.
+    cv::Mat* planes[3] = {&result->range, &result->sigma, &result->score};
+    for (int i = 0; i < 3; ++i) {
+      if (planes_[i].empty() || planes_[i].u->refcount != 1)
+        planes_[i] = cv::Mat(height, width, CV_32FC1);
+      *planes[i] = planes_[i];
+    }
     std::vector<TriangulateJob> jobs(strips);
     forRows([&](std::size_t s, int begin, int end) {
       TriangulateJob& job = jobs[s];
@@ -624,7 +650,7 @@ class SweepMatcher : public Matcher {
       for (int y = begin; y < end; ++y) {
         job.a = &level.map.a[static_cast<std::size_t>(y) * width];
         job.h = smooth_.ptr<float>(y);
-        job.cost = cost_.ptr<std::uint16_t>(y);
+        job.value = value_.ptr<std::int32_t>(y);
         job.steep = steep_.ptr<std::uint16_t>(y);
         job.range = result->range.ptr<float>(y);
         job.sigma = result->sigma.ptr<float>(y);
@@ -649,11 +675,12 @@ class SweepMatcher : public Matcher {
   EpipolarFrame frame_;
   std::vector<Level> levels_;
   tbb::enumerable_thread_specific<Scratch> scratch_;
-  cv::Mat cost_, steep_, claim_, smooth_;  ///< of the finest level
-  std::size_t field_ = 0;                  ///< pixels with a ray
-  float finest_step_ = 0;                  ///< least hypothesis step of any band
+  cv::Mat value_, steep_, claim_, smooth_;  ///< of the finest level
+  cv::Mat planes_[3];                       ///< of the last result
+  std::size_t field_ = 0;                   ///< pixels with a ray
+  float finest_step_ = 0;                   ///< least hypothesis step of any band
   // Claims on spots of the displaced image, kept on an equal-area map of (phi, theta').
-  std::vector<std::uint32_t> claims_;
+  std::vector<std::int32_t> claims_;
   cv::Size claim_size_;
   float claim_x_ = 0, claim_y_offset_ = 0;
   std::vector<std::pair<int, int>> claim_rows_;  ///< by tile, first and last
