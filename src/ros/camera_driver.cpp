@@ -17,8 +17,10 @@ using Steady = std::chrono::steady_clock;
 constexpr std::chrono::milliseconds kGrabTimeout(200);
 // An unplugged camera is told of once, and again now and then.
 constexpr std::chrono::seconds kRepeatProblem(30);
-// The stage of a recording stands at its position this long around a settled frame [s].
-constexpr double kSettledAround = 0.05;
+// The stage of a recording stands at its position this long around a settled frame [s], and no
+// longer than the intervals between frames allow.
+constexpr double kSettledAround = 0.0491;
+constexpr double kSettledShare = 0.4;
 
 double secondsSince(Steady::time_point time) {
   return std::chrono::duration<double>(Steady::now() - time).count();
@@ -100,6 +102,7 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
     static_frames_->add(toTransformStamped(opticalInLink(), now, link, parameters_.frame_id));
   }
   images_ = image_transport::ImageTransport(node_).advertiseCamera("image_raw", 4);
+  lens_subscriber_ = node_.subscribe("lens_model", 1, &CameraDriver::onLens, this);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
   thread_ = std::thread(&CameraDriver::run, this);
@@ -292,9 +295,14 @@ void CameraDriver::publishRecordedStage(const device::Frame& frame, const ros::T
   const Pose pose(Eigen::Translation3d(parameters_.axis * *frame.stage_position_m));
   const bool settled = frame.settled.value_or(true);
   std::vector<ros::Time> times = {stamp};
-  if (settled && stamp.toSec() > kSettledAround) {
+  double around = kSettledAround;
+  if (recorded_stamp_ < stamp) {
+    around = std::min(around, kSettledShare * (stamp - recorded_stamp_).toSec());
+  }
+  recorded_stamp_ = stamp;
+  if (settled && stamp.toSec() > around) {
     // Whoever asks whether the stage stood still finds it standing around the stamp.
-    times = {stamp - ros::Duration(kSettledAround), stamp, stamp + ros::Duration(kSettledAround)};
+    times = {stamp - ros::Duration(around), stamp, stamp + ros::Duration(around)};
   }
   std::vector<geometry_msgs::TransformStamped> transforms;
   for (const ros::Time& time : times) {
@@ -344,11 +352,27 @@ void CameraDriver::setLens(LensFile file) {
   header.stamp = ros::Time::now();
   header.frame_id = parameters_.frame_id;
   const LensModelMessage message = toLensModelMessage(lens->file, header);
+  lens->yaml = message.yaml;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     lens_ = std::move(lens);
   }
   lens_publisher_.publish(message);
+}
+
+void CameraDriver::onLens(const LensModelMessage::ConstPtr& message) {
+  try {
+    if (message->header.frame_id != parameters_.frame_id) return;
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      if (lens_ && lens_->yaml == message->yaml) return;
+    }
+    // Published again by us, so that the latched messages of both agree.
+    setLens(fromLensModelMessage(*message, "lens_model"));
+    ROS_INFO("took over a new calibration");
+  } catch (const std::exception& e) {
+    ROS_WARN_STREAM_THROTTLE(10.0, "lens_model refused: " << printable(e.what(), 1000));
+  }
 }
 
 void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {

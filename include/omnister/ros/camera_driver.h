@@ -2,10 +2,10 @@
 /// @file The body of the camera node and nodelet.
 ///
 /// Publishes `image_raw` and `camera_info` with identical headers (stamp: middle of the exposure),
-/// latched `lens_model`, `/diagnostics`, and the static frames of its mount. The device is opened
-/// at once, streams only while someone listens, and is opened again when it was lost. A recording
-/// that knows stage positions also publishes `stage_state` and the stage's tf.
-
+/// latched `lens_model`, `/diagnostics`, and the static frames of its mount. A lens that another
+/// node publishes on `lens_model` for our frame is taken over. The device is opened at once,
+/// streams only while someone listens, and is opened again when it was lost. A recording that knows
+/// stage positions also publishes `stage_state` and the stage's tf.
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
@@ -26,6 +26,7 @@
 #include "omnister/device/camera.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/ros/lens_store.h"
+#include "omnister/ros/messages.h"
 #include "omnister/ros/static_frames.h"
 
 namespace omnister {
@@ -71,6 +72,7 @@ class CameraDriver {
   struct Lens {
     LensFile file;
     sensor_msgs::CameraInfo info;
+    std::string yaml;
   };
 
   void run();
@@ -87,6 +89,8 @@ class CameraDriver {
 
   void chooseLens();
   void setLens(LensFile file);
+  /// Takes over a lens that a calibration publishes beside us.
+  void onLens(const LensModelMessage::ConstPtr& message);
   std::string storeName() const;
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
@@ -112,6 +116,7 @@ class CameraDriver {
   bool streaming_ = false;
   std::optional<std::uint64_t> last_sequence_;
   std::chrono::steady_clock::time_point last_frame_;
+  ros::Time recorded_stamp_;
   std::string told_problem_;
   std::chrono::steady_clock::time_point told_at_;
 
@@ -120,6 +125,7 @@ class CameraDriver {
   image_transport::CameraPublisher images_;
   ros::Publisher lens_publisher_;
   ros::Publisher stage_publisher_;
+  ros::Subscriber lens_subscriber_;
   diagnostic_updater::Updater diagnostics_;
   std::atomic<bool> stop_{false};
   std::thread thread_;
