@@ -30,6 +30,8 @@ struct Corner {
 
 std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& target,
                                        const Budget& budget);
+/// Columns and rows of inner corners of whatever checkerboard is seen, the larger first.
+std::optional<cv::Size> checkerboardSize(const GrayImage& image);
 std::vector<Corner> detectCircles(const GrayImage& image, const Target& target,
                                   const Budget& budget);
 std::vector<Corner> detectCharuco(const GrayImage& image, const Target& target,

@@ -72,7 +72,56 @@ bool refine(const cv::Mat& fine, int cols, int rows, std::vector<cv::Point2f>& c
   return lost * 10 <= static_cast<std::ptrdiff_t>(corners.size());
 }
 
+// Whether the pattern goes on beyond one of its sides: then it is not the board that was asked for,
+// and which part of it was found is chance.
+bool goesOn(const cv::Mat& fine, const Target& target, const Expected& frames,
+            bool first_square_dark) {
+  const double side = target.square_m;
+  const int cols = target.cols;
+  const int rows = target.rows;
+  for (const Eigen::Vector2i& out : {Eigen::Vector2i(1, 0), Eigen::Vector2i(-1, 0),
+                                     Eigen::Vector2i(0, 1), Eigen::Vector2i(0, -1)}) {
+    const int length = out.x() != 0 ? rows : cols;
+    int corners = 0;
+    for (int i = 0; i < length; ++i) {
+      const int col = out.x() == 0 ? i : (out.x() > 0 ? cols - 1 : 0);
+      const int row = out.y() == 0 ? i : (out.y() > 0 ? rows - 1 : 0);
+      const auto& frame = frames[row * cols + col];
+      if (!frame) continue;
+      // One square further, where the squares' colours are swapped.
+      LocalFrame next = *frame;
+      next.pixel += next.jacobian * (side * out.cast<double>());
+      std::vector<cv::Point2f> corner{
+          {static_cast<float>(next.pixel.x()), static_cast<float>(next.pixel.y())}};
+      const double spacing =
+          side * std::min(next.jacobian.col(0).norm(), next.jacobian.col(1).norm());
+      refineCorners(fine, {halfWindow(spacing)}, corner);
+      next.pixel = {corner[0].x, corner[0].y};
+      const bool dark = ((col + out.x() + row + out.y()) % 2 == 0) == first_square_dark;
+      const unsigned quadrants = dark ? kPlusPlus | kMinusMinus : kMinusPlus | kPlusMinus;
+      corners += cornerContrast(fine, next, quadrants, 0.4 * side) > 2.0;
+    }
+    if (10 * corners >= 8 * length) return true;
+  }
+  return false;
+}
+
 }  // namespace
+
+std::optional<cv::Size> checkerboardSize(const GrayImage& image) {
+  constexpr double kPixels = 0.8e6;
+  const double total = static_cast<double>(image.eight_bit.total());
+  const ScaledImage copy = scaled(image.eight_bit, std::min(1.0, std::sqrt(kPixels / total)));
+  std::vector<cv::Point2f> corners;
+  cv::Mat meta;
+  try {
+    const int flags = cv::CALIB_CB_NORMALIZE_IMAGE | cv::CALIB_CB_EXHAUSTIVE | cv::CALIB_CB_LARGER;
+    if (!cv::findChessboardCornersSB(copy.image, {3, 3}, corners, flags, meta)) return std::nullopt;
+  } catch (const cv::Exception&) {
+    return std::nullopt;
+  }
+  return cv::Size(std::max(meta.cols, meta.rows), std::min(meta.cols, meta.rows));
+}
 
 std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& target,
                                        const Budget& budget) {
@@ -109,6 +158,7 @@ std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& tar
       coarse.emplace_back(Eigen::Vector2d(corner.x, corner.y));
     const Expected frames = framesFromGrid(coarse, target);
     const bool first_square_dark = firstSquareContrast(image.fine, target, frames) >= 0.0;
+    if (goesOn(image.fine, target, frames, first_square_dark)) return {};
     const Measured measured = measurePoints(image.fine, target, frames, first_square_dark);
     std::vector<Corner> result;
     for (std::size_t i = 0; i < ordered->size(); ++i) {

@@ -19,14 +19,15 @@ struct DetectorOptions {
   int threads = 0;                 ///< 0: every core
 };
 
-/// Finds the target in one image of any depth and channel count. Corner positions carry no half-pixel
-/// bias.
-/// @return nullopt when it is not there; partial boards only with coded targets
+/// Finds the target in one image of any depth and channel count. Corner positions carry no
+/// half-pixel bias.
+/// @return nullopt when it is not there, or when it is part of a larger checkerboard; partial
+/// boards only with coded targets
 std::optional<ViewDetections> detectTarget(const cv::Mat& image, const Target& target,
                                            const DetectorOptions& options = {});
 
-/// Second pass: predicts every corner with a fitted lens, refines each in a window of a quarter of the
-/// local spacing, and adds those that the detector missed.
+/// Second pass: predicts every corner with a fitted lens, refines each in a window of a quarter of
+/// the local spacing, and adds those that the detector missed.
 /// @param first corners of the first pass (at least 4)
 ViewDetections refineGuided(const cv::Mat& image, const Target& target, const LensModel& lens,
                             const ViewDetections& first);
@@ -36,5 +37,10 @@ ViewDetections refineGuided(const cv::Mat& image, const Target& target, const Le
 Detections detectInFiles(const std::vector<std::string>& image_files, const Target& target,
                          const DetectorOptions& options, std::vector<std::string>* missed,
                          const Progress& progress = {});
+
+/// Inner corners (columns and rows, the larger first) of a plain checkerboard of any size: for
+/// telling a person which board the images show when it is not the one that was asked for.
+/// @return nullopt when no board is seen
+std::optional<cv::Size> checkerboardSize(const cv::Mat& image);
 
 }  // namespace omnister

@@ -192,6 +192,110 @@ TEST_F(ImageFiles, ImagesWithoutTheTargetAreNamed) {
   EXPECT_EQ(told.back(), 1.0);
 }
 
+// A board drawn flat, its first corner at (x, y), blurred a little; turned clockwise by quarters.
+cv::Mat drawBoard(const Target& target, int quarters, cv::Size size = {640, 480}, double x = 160.3,
+                  double y = 120.6, double square = 30.2) {
+  cv::Mat fine(size * 8, CV_8UC1, cv::Scalar(215));
+  const TargetArtwork art = targetArtwork(target);
+  const double scale = 8 * square / target.square_m;
+  for (const auto& r : art.rectangles) {
+    const cv::Point2d corner(r.x * scale + 8 * (x + 0.5), r.y * scale + 8 * (y + 0.5));
+    cv::rectangle(fine, cv::Rect2d(corner, cv::Size2d(r.width * scale, r.height * scale)),
+                  cv::Scalar(35), cv::FILLED);
+  }
+  cv::Mat image;
+  cv::resize(fine, image, size, 0, 0, cv::INTER_AREA);
+  cv::GaussianBlur(image, image, {}, 0.8);
+  for (int quarter = 0; quarter < quarters; ++quarter) {
+    cv::rotate(image, image, cv::ROTATE_90_CLOCKWISE);
+  }
+  return image;
+}
+
+TEST(Detector, NumbersAnAsymmetricBoardAlikeHoweverItIsTurned) {
+  const Target target{TargetType::kCheckerboard, 8, 5, 0.02};
+  const auto upright = detectTarget(drawBoard(target, 0), target);
+  ASSERT_TRUE(upright.has_value());
+  int same = 0;
+  for (int quarters = 0; quarters < 4; ++quarters) {
+    const cv::Mat image = drawBoard(target, quarters);
+    const auto view = detectTarget(image, target);
+    ASSERT_TRUE(view.has_value()) << quarters;
+    for (std::size_t i = 0; i < view->pixels.size(); ++i) {
+      EXPECT_TRUE(view->points[i].isApprox(upright->points[i]));
+      // Turned back.
+      Eigen::Vector2d pixel = view->pixels[i];
+      int width = image.cols;
+      int height = image.rows;
+      for (int quarter = 0; quarter < quarters; ++quarter) {
+        pixel = {pixel.y(), width - 1 - pixel.x()};
+        std::swap(width, height);
+      }
+      EXPECT_LT((pixel - upright->pixels[i]).norm(), 0.05);
+      ++same;
+    }
+  }
+  EXPECT_EQ(same, 160);
+}
+
+TEST(Detector, FindsTheSameCornersAtAnyDepth) {
+  const Target target{TargetType::kCheckerboard, 8, 6, 0.02};
+  const cv::Mat gray = drawBoard(target, 0);
+  const auto truth = detectTarget(gray, target);
+  ASSERT_TRUE(truth.has_value());
+  std::vector<cv::Mat> images(6);
+  cv::cvtColor(gray, images[0], cv::COLOR_GRAY2BGR);
+  cv::cvtColor(gray, images[1], cv::COLOR_GRAY2BGRA);
+  gray.convertTo(images[2], CV_16U, 4.0);  // ten bits in sixteen
+  gray.convertTo(images[3], CV_16U, 257.0);
+  gray.convertTo(images[4], CV_32F, 1.0 / 255);
+  gray.convertTo(images[5], CV_64F, 1e-3, -7.0);
+  int compared = 0;
+  for (const cv::Mat& image : images) {
+    const auto view = detectTarget(image, target);
+    ASSERT_TRUE(view.has_value()) << compared;
+    for (std::size_t i = 0; i < view->pixels.size(); ++i) {
+      EXPECT_LT((view->pixels[i] - truth->pixels[i]).norm(), 0.02) << compared;
+    }
+    ++compared;
+  }
+  EXPECT_EQ(compared, 6);
+}
+
+TEST(Detector, PartOfALargerBoardIsNotTheBoard) {
+  const Target shown{TargetType::kCheckerboard, 8, 6, 0.02};
+  const cv::Mat image = drawBoard(shown, 0);
+  EXPECT_TRUE(detectTarget(image, shown).has_value());
+  for (const auto& [cols, rows] : {std::pair{6, 4}, {7, 6}, {8, 5}, {6, 6}, {4, 3}}) {
+    const Target asked{TargetType::kCheckerboard, cols, rows, 0.02};
+    EXPECT_FALSE(detectTarget(image, asked).has_value()) << cols << " x " << rows;
+  }
+  EXPECT_EQ(checkerboardSize(image), cv::Size(8, 6));
+  EXPECT_EQ(checkerboardSize(cv::Mat(200, 300, CV_8UC1, cv::Scalar(7))), std::nullopt);
+  EXPECT_EQ(checkerboardSize(cv::Mat()), std::nullopt);
+}
+
+TEST_F(ImageFiles, CornersAreTheSameForAnyNumberOfThreads) {
+  const Target target{TargetType::kCheckerboard, 8, 6, 0.02};
+  std::vector<std::string> files;
+  for (int i = 0; i < 6; ++i) {
+    files.push_back(
+        write(std::to_string(i) + ".png",
+              drawBoard(target, 0, {640, 480}, 120.1 + 7.3 * i, 90.4 + 5.7 * i, 25.0 + i)));
+  }
+  DetectorOptions options;
+  options.threads = 1;
+  const Detections one = detectInFiles(files, target, options, nullptr);
+  options.threads = 3;
+  const Detections three = detectInFiles(files, target, options, nullptr);
+  ASSERT_EQ(one.views.size(), 6u);
+  ASSERT_EQ(three.views.size(), 6u);
+  for (std::size_t i = 0; i < one.views.size(); ++i) {
+    EXPECT_EQ(one.views[i].name, files[i]);
+    EXPECT_EQ(one.views[i].pixels, three.views[i].pixels);
+  }
+}
+
 TEST(Detector, SmallAndStrangeImagesHaveNoBoard) {
   const Target target{TargetType::kCheckerboard, 8, 6, 0.02};
   int searched = 0;
