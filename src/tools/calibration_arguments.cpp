@@ -5,6 +5,7 @@
 
 #include "omnister/calibration/detector.h"
 #include "omnister/common/error.h"
+#include "omnister/common/image_file.h"
 
 namespace omnister::tools {
 
@@ -44,6 +45,27 @@ CalibrationOptions calibrationOptions(const CalibrationArguments& arguments) {
   return options;
 }
 
+namespace {
+
+// The commonest mistake: squares counted in place of inner corners, or another board than the
+// file's.
+void checkBoardSize(const Target& target, const std::string& target_file,
+                    const std::vector<std::string>& missed) {
+  if (target.type != TargetType::kCheckerboard) return;
+  constexpr std::size_t kLooks = 3;
+  const cv::Size asked(std::max(target.cols, target.rows), std::min(target.cols, target.rows));
+  for (std::size_t i = 0; i < std::min(kLooks, missed.size()); ++i) {
+    const auto seen = checkerboardSize(readImage(missed[i], ImageColor::kGray));
+    if (!seen || *seen == asked) continue;
+    throw InputError(target_file, "cols and rows",
+                     "are " + std::to_string(target.cols) + " and " + std::to_string(target.rows) +
+                         ", but " + missed[i] + " shows a board of " + std::to_string(seen->width) +
+                         " x " + std::to_string(seen->height) + " inner corners");
+  }
+}
+
+}  // namespace
+
 Detections gatherDetections(const CalibrationArguments& arguments,
                             const std::vector<std::string>& images,
                             const std::string& detections_file, bool keep_missed) {
@@ -56,6 +78,7 @@ Detections gatherDetections(const CalibrationArguments& arguments,
   std::vector<std::string> missed;
   Detections detections = detectInFiles(images, target, options, &missed, consoleProgress());
   for (const std::string& name : missed) say("no board found in " + printable(name));
+  if (detections.views.empty()) checkBoardSize(target, arguments.target_file, missed);
   if (!keep_missed) return detections;
   Detections all;
   all.image_size = detections.image_size;
