@@ -83,7 +83,7 @@ LensFit fitLens(const LensModel& start, const std::vector<Eigen::Vector3d>& bear
       LensPtr next = step.allFinite() ? out.lens->withParameters(next_values) : nullptr;
       const auto next_cost = next ? cost(*next, bearings, pixels) : std::nullopt;
       if (next_cost && *next_cost < *now) {
-        converged = *now - *next_cost <= 1e-13 * *now;
+        converged = *now - *next_cost <= options.tolerance * *now;
         values = next_values;
         out.lens = std::move(next);
         now = next_cost;

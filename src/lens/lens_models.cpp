@@ -33,29 +33,56 @@ constexpr double kFieldSlack = 1e-8;  // [rad]
 // a into a + (1 + |m|^2) T(m), T being Brown's tangential terms and 1 + |m|^2 = 2 |dm/da|. Radii of
 // wide lenses are about proportional to theta, so that this is a shift on the sensor that gathers
 // at the rim: measured on real lenses past 90 degrees, T(m) alone leaves a tenth more error.
+//
+// With e = (d2, d1) and T's two parts growing apart as d3 and d4 say, the shift is
+//     2 (m . e) m (1 + (1 + d3) |m|^2) + |m|^2 e (1 + (1 + d4) |m|^2)
+// which for d3 = d4 = 0 is (1 + |m|^2) T(m) with
+//     T(m) = (2 d1 x y + d2 (|m|^2 + 2 x^2), d1 (|m|^2 + 2 y^2) + 2 d2 x y).
 struct Decentring {
-  Eigen::Vector2d d = Eigen::Vector2d::Zero();
+  Eigen::Vector2d e = Eigen::Vector2d::Zero();
+  double d3 = 0.0;
+  double d4 = 0.0;
 
-  // (2 d1 x y + d2 (r^2 + 2 x^2), d1 (r^2 + 2 y^2) + 2 d2 x y)
-  Eigen::Vector2d brown(const Eigen::Vector2d& m) const {
-    return m.squaredNorm() * d.reverse() + 2.0 * m.dot(d.reverse()) * m;
-  }
   Eigen::Vector2d shift(const Eigen::Vector2d& m) const {
-    return (1.0 + m.squaredNorm()) * brown(m);
+    const double mm = m.squaredNorm();
+    return (2.0 * m.dot(e) * (1.0 + (1.0 + d3) * mm)) * m + (mm * (1.0 + (1.0 + d4) * mm)) * e;
   }
   // d(shift)/dm
   Eigen::Matrix2d jacobian(const Eigen::Vector2d& m) const {
-    const Eigen::Vector2d e = d.reverse();
-    Eigen::Matrix2d d_brown = 2.0 * (e * m.transpose() + m * e.transpose());
-    d_brown.diagonal().array() += 2.0 * m.dot(e);
-    return (1.0 + m.squaredNorm()) * d_brown + 2.0 * brown(m) * m.transpose();
-  }
-  static Eigen::Matrix2d byParameters(const Eigen::Vector2d& m) {
     const double mm = m.squaredNorm();
-    const double xy = 2.0 * m.x() * m.y();
-    Eigen::Matrix2d out;
-    out << xy, mm + 2.0 * m.x() * m.x(), mm + 2.0 * m.y() * m.y(), xy;
-    return (1.0 + mm) * out;
+    const double me = 2.0 * m.dot(e);
+    const double k = 1.0 + (1.0 + d3) * mm;
+    Eigen::Matrix2d out = (2.0 * k) * m * e.transpose() +
+                          (2.0 * me * (1.0 + d3)) * m * m.transpose() +
+                          (2.0 + 4.0 * (1.0 + d4) * mm) * e * m.transpose();
+    out.diagonal().array() += me * k;
+    return out;
+  }
+  // By d1, d2, d3, d4.
+  Eigen::Matrix<double, 2, 4> byParameters(const Eigen::Vector2d& m) const {
+    const double mm = m.squaredNorm();
+    const double k = 2.0 * (1.0 + (1.0 + d3) * mm);
+    const double l = mm * (1.0 + (1.0 + d4) * mm);
+    Eigen::Matrix<double, 2, 4> out;
+    out.col(0) = k * m.y() * m + l * Eigen::Vector2d::UnitY();
+    out.col(1) = k * m.x() * m + l * Eigen::Vector2d::UnitX();
+    out.col(2) = (2.0 * m.dot(e) * mm) * m;
+    out.col(3) = (mm * mm) * e;
+    return out;
+  }
+  // Bounds over the disc |m| <= radius of the shift [rad], and of its change per radian: below one
+  // the shifted angles are one-to-one. |dm/da| <= (1 + |m|^2) / 2.
+  struct Bounds {
+    double shift;
+    double steepness;
+  };
+  Bounds bounds(double radius) const {
+    const double square = radius * radius;
+    const double p = e.norm() * radius;
+    const double grown3 = std::abs(1.0 + d3) * square;
+    const double grown4 = std::abs(1.0 + d4) * square;
+    return {p * radius * (3.0 + 2.0 * grown3 + grown4),
+            0.5 * (1.0 + square) * p * (6.0 + 8.0 * grown3 + 4.0 * grown4)};
   }
 };
 
@@ -118,8 +145,11 @@ Eigen::Matrix2d planeOfAnglesJacobian(const Eigen::Vector2d& a) {
 
 struct Extras {
   bool affinity = false;
+  bool turn = false;
   bool decentring = false;
-  int size() const { return (affinity ? 2 : 0) + (decentring ? 2 : 0); }
+  bool growth = false;
+  int bends() const { return decentring ? (growth ? 4 : 2) : 0; }
+  int size() const { return (affinity ? 2 : 0) + (turn ? 1 : 0) + bends(); }
 };
 
 template <typename Surface>
@@ -166,7 +196,8 @@ class CentralLens final : public LensModel {
         const Eigen::Matrix2d d_a = d_n * fromAnglesJacobian(a_bent);
         if (d_parameters != nullptr) {
           d_parameters->resize(2, size());
-          d_parameters->template rightCols<2>() = linear_ * d_a * Decentring::byParameters(m);
+          d_parameters->rightCols(extras_.bends()) =
+              linear_ * d_a * decentring_.byParameters(m).leftCols(extras_.bends());
         }
         if (d_bearing != nullptr) {
           d_n = d_a * (toAnglesJacobian(n) + decentring_.jacobian(m) * toPlaneJacobian(n));
@@ -184,6 +215,7 @@ class CentralLens final : public LensModel {
       if (extras_.affinity) {
         d_parameters->template middleCols<2>(2 + n_surface) << xy.x(), xy.y(), 0.0, 0.0;
       }
+      if (extras_.turn) d_parameters->col(4 + n_surface) << 0.0, xy.x();
     }
     return center_ + linear_ * xy;
   }
@@ -220,12 +252,18 @@ class CentralLens final : public LensModel {
     surface_.get(out.data() + 2);
     int i = 2 + surface_.size();
     if (extras_.affinity) {
-      out[i++] = linear_(0, 0) - 1.0;
+      out[i++] = p_;  // not from 1 + p, which loses digits of a small p
       out[i++] = linear_(0, 1);
-      // 1 + p loses digits of a small p.
-      out[i - 2] = p_;
     }
-    if (extras_.decentring) out.tail<2>() = decentring_.d;
+    if (extras_.turn) out[i++] = linear_(1, 0);
+    if (extras_.decentring) {
+      out[i++] = decentring_.e.y();
+      out[i++] = decentring_.e.x();
+    }
+    if (extras_.growth) {
+      out[i++] = decentring_.d3;
+      out[i++] = decentring_.d4;
+    }
     return out;
   }
 
@@ -233,7 +271,9 @@ class CentralLens final : public LensModel {
     std::vector<std::string> out{"cx", "cy"};
     for (auto& name : surface_.names()) out.push_back(std::move(name));
     if (extras_.affinity) out.insert(out.end(), {"p", "q"});
+    if (extras_.turn) out.push_back("s");
     if (extras_.decentring) out.insert(out.end(), {"d1", "d2"});
+    if (extras_.growth) out.insert(out.end(), {"d3", "d4"});
     return out;
   }
 
@@ -253,22 +293,27 @@ class CentralLens final : public LensModel {
     if (extras_.affinity) {
       out->p_ = parameters[i];
       const double q = parameters[i + 1];
-      if (!(std::abs(out->p_) <= 0.9) || !(std::abs(q) <= 10.0)) return nullptr;
-      out->linear_ << 1.0 + out->p_, q, 0.0, 1.0;
-      out->inverse_linear_ << 1.0, -q, 0.0, 1.0 + out->p_;
-      out->inverse_linear_ /= 1.0 + out->p_;
+      const double turn = extras_.turn ? parameters[i + 2] : 0.0;
+      const double determinant = 1.0 + out->p_ - q * turn;
+      if (!(std::abs(out->p_) <= 0.9) || !(std::abs(q) <= 10.0) || !(std::abs(turn) <= 10.0) ||
+          !(determinant >= 0.05)) {
+        return nullptr;
+      }
+      out->linear_ << 1.0 + out->p_, q, turn, 1.0;
+      out->inverse_linear_ << 1.0, -q, -turn, 1.0 + out->p_;
+      out->inverse_linear_ /= determinant;
     }
     double bent_field = field;
     if (extras_.decentring) {
-      out->decentring_.d = parameters.tail<2>();
-      // With |T| <= 3 |d| |m|^2, |dT/dm| <= 6 |d| |m| and |dm/da| <= (1 + |m|^2) / 2 the shift
-      // changes by at most 3 |d| |m| (1 + 2 |m|^2) (1 + |m|^2) per radian: below one over the disc
-      // of the field, it is one-to-one there.
-      const double radius = std::tan(0.5 * field);
-      const double square = radius * radius;
-      const double bend = 3.0 * out->decentring_.d.norm() * radius * (1.0 + square);
-      if (!(bend * (1.0 + 2.0 * square) < 0.95)) return nullptr;
-      bent_field = std::min(field + bend * radius, kLargestField);
+      const auto d = parameters.tail(extras_.bends());
+      out->decentring_.e = {d[1], d[0]};
+      if (extras_.growth) {
+        out->decentring_.d3 = d[2];
+        out->decentring_.d4 = d[3];
+      }
+      const Decentring::Bounds bounds = out->decentring_.bounds(std::tan(0.5 * field));
+      if (!(bounds.steepness < 0.95)) return nullptr;
+      bent_field = std::min(field + bounds.shift, kLargestField);
     }
     const auto surface = surface_.with(parameters.data() + 2, bent_field + kFieldSlack);
     if (!surface) return nullptr;
@@ -351,7 +396,14 @@ std::string known() {
 
 // A lens of the structure that carries no numbers yet.
 LensPtr prototype(const LensStructure& structure, double span) {
-  const Extras extras{structure.affinity, structure.decentring};
+  const Extras extras{structure.affinity, structure.turn, structure.decentring,
+                      structure.decentring_growth};
+  if (structure.turn && !structure.affinity) {
+    throw Error("a lens with a turn (s) but no affinity, expected both");
+  }
+  if (structure.decentring_growth && !structure.decentring) {
+    throw Error("a lens with growing decentring (d3, d4) but no decentring, expected both");
+  }
   const std::string& model = structure.model;
   if (structure.decentring && model != "asphere" && model != "spline") {
     throw Error("lens model " + printable(model) +
@@ -452,7 +504,9 @@ LensStructure structureOf(const LensModel& lens) {
   out.affinity = false;
   const auto extras = [&](const Extras& e) {
     out.affinity = e.affinity;
+    out.turn = e.turn;
     out.decentring = e.decentring;
+    out.decentring_growth = e.growth;
   };
   if (const auto* spherical = dynamic_cast<const SphericalLens*>(&lens)) {
     extras(spherical->extras());
@@ -497,11 +551,14 @@ LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
                      "is \"" + printable(model) + "\", expected one of " + known());
   }
   const auto given = [&](const char* name) { return parameters.count(name) != 0; };
-  structure.affinity = given("p") || given("q");
-  structure.decentring = given("d1") || given("d2");
+  structure.turn = given("s");
+  structure.affinity = given("p") || given("q") || structure.turn;
+  structure.decentring_growth = given("d3") || given("d4");
+  structure.decentring = given("d1") || given("d2") || structure.decentring_growth;
   if (structure.decentring && model != "asphere" && model != "spline") {
-    throw InputError(source, place + (given("d1") ? ".d1" : ".d2"),
-                     "is given, but a " + structure.model + " surface has no decentring");
+    throw InputError(
+        source, place,
+        "give decentring (d1 to d4), but a " + structure.model + " surface has no decentring");
   }
   if (given("a4")) structure.even_terms = 1;
   if (given("a6")) structure.even_terms = 2;
@@ -574,7 +631,8 @@ LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
       values[i] = radii[i - 2];
       continue;
     }
-    const bool neutral = names[i] == "p" || names[i] == "q" || names[i] == "d1" || names[i] == "d2";
+    const bool neutral = names[i] == "p" || names[i] == "q" || names[i] == "s" ||
+                         (names[i].size() == 2 && names[i][0] == 'd');
     values[i] = number(names[i], neutral ? std::optional<double>(0.0) : std::nullopt);
   }
   LensPtr lens = bare->withParameters(values, max_theta);

@@ -20,6 +20,7 @@ namespace omnister::tools {
 // One line a subcommand, in the order of --help.
 // (declarations here, table below: kept together so that adding a command touches one place)
 void addCalibrate(CLI::App& app);
+void addImport(CLI::App& app);
 void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
 void addStereo(CLI::App& app);
@@ -32,6 +33,7 @@ namespace {
 
 constexpr AddCommand kCommands[] = {
     addCalibrate,
+    addImport,
     addProject,
     addUnproject,
     addStereo,

@@ -14,6 +14,7 @@ struct LensFitOptions {
   int first_parameter = 0;  ///< of LensModel::parameters(): those before it stay
   int parameters = -1;      ///< how many are fitted from there; all that follow when negative
   int max_iterations = 100;
+  double tolerance = 1e-13;  ///< ends when a step lowers the cost by less than this part of it
 };
 
 struct LensFit {

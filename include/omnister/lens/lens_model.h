@@ -3,7 +3,8 @@
 ///
 /// Conventions. Optical frame (REP 103): +x right, +y down, +z forward. Pixel (0, 0) is the centre
 /// of the top-left pixel. A pixel becomes sensor coordinates about the centre of distortion,
-///     [x; y] = [[1 + p, q], [0, 1]]^-1 (pixel - center)          (affinity; p = q = 0 without one)
+///     [x; y] = [[1 + p, q], [s, 1]]^-1 (pixel - center)     (affinity; p = q = s = 0 without one;
+///                                                            s only in imported lenses)
 /// and then the viewing ray (x, y, h(x, y)), h being the height of the lens surface in pixels
 /// (Johnson 1997, sec. 4.2). All models are central. Rays may point behind the camera.
 #pragma once

@@ -22,7 +22,12 @@ struct LensStructure {
   int even_terms = 0;       ///< asphere: how many of r^4, r^6, r^8 (0 to 3)
   int knots = 12;           ///< spline: knots spaced evenly in angle (4 to 32)
   bool affinity = false;    ///< p and q
-  bool decentring = false;  ///< asphere and spline only
+  bool decentring = false;  ///< asphere and spline only: d1 and d2
+  /// d3 and d4 as well: decentring that grows otherwise than Brown's with the angle.
+  bool decentring_growth = false;
+  /// s as well: a foreign camera may be turned about its axis against its own image. Never in a
+  /// calibration from boards, whose poses would turn along.
+  bool turn = false;
 };
 
 /// A lens of the structure that is nearest to the equidistant fisheye r = f theta: the starting

@@ -85,6 +85,21 @@ std::vector<Case> cases() {
        join(asphere.head(5), affinity)},
       {"asphere_3_all", structure("asphere", true, true, 3), 110 * kDegree,
        join(asphere, join(affinity, decentring))},
+      {"asphere_3_turned",
+       [] {
+         LensStructure s = structure("asphere", true, true, 3);
+         s.turn = true;
+         return s;
+       }(),
+       110 * kDegree, join(asphere, join(numbers({0.004, -0.03, 0.033}), decentring))},
+      {"spline_16_growing",
+       [] {
+         LensStructure s = structure("spline", false, true, 0, 16);
+         s.decentring_growth = true;
+         return s;
+       }(),
+       100 * kDegree,
+       join(wavyRadii(16, 300.0, 100 * kDegree), numbers({1.5e-3, -0.8e-3, 0.7, -1.3}))},
       {"asphere_3_wide", structure("asphere", false, true, 3), 140 * kDegree, {}},
       {"spline_4", structure("spline", false, false, 0, 4), 95 * kDegree, {}},
       {"spline_12_wide", structure("spline", false, false, 0, 12), 150 * kDegree,
@@ -264,7 +279,7 @@ TEST_P(EveryLens, SurfaceHeightGivesTheRay) {
     // Rays are (x, y, h) before decentring and after the affinity is undone: look at the bare
     // surface.
     LensStructure bare = s;
-    bare.decentring = bare.affinity = false;
+    bare.decentring_growth = bare.decentring = bare.affinity = bare.turn = false;
     const LensPtr start = makeLens(bare, lens_->center(), 300.0, GetParam().max_theta);
     lens_ = start->withParameters(lens_->parameters().head(start->parameters().size()));
     ASSERT_NE(lens_, nullptr);
@@ -332,6 +347,8 @@ TEST_P(EveryLens, StructureAndNumbersComeBack) {
   EXPECT_EQ(s.model, expected.model);
   EXPECT_EQ(s.model, lens_->model());
   EXPECT_EQ(s.affinity, expected.affinity);
+  EXPECT_EQ(s.turn, expected.turn);
+  EXPECT_EQ(s.decentring_growth, expected.decentring_growth);
   EXPECT_EQ(s.decentring, expected.decentring);
   if (s.model == "asphere") {
     EXPECT_EQ(s.even_terms, expected.even_terms);
