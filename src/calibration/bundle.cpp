@@ -10,6 +10,8 @@
 #include <cmath>
 #include <memory>
 
+#include "pose_block.h"
+
 namespace omnister::calibration {
 
 namespace {
@@ -17,52 +19,7 @@ namespace {
 /// What a corner that has no pixel at all costs: far more than any real one.
 constexpr double kNowherePx = 1e3;
 
-using Vector6d = Eigen::Matrix<double, 6, 1>;
 using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-
-Eigen::Matrix3d cross(const Eigen::Vector3d& v) {
-  Eigen::Matrix3d m;
-  m << 0, -v.z(), v.y(), v.z(), 0, -v.x(), -v.y(), v.x(), 0;
-  return m;
-}
-
-/// A pose as rotation vector and translation, with what its derivative needs.
-struct PoseValue {
-  Eigen::Matrix3d R;
-  Eigen::Vector3d t;
-  Eigen::Matrix3d right_jacobian;  ///< of the exponential map at the rotation vector
-
-  explicit PoseValue(const double* block) {
-    const Eigen::Map<const Eigen::Vector3d> w(block);
-    t = Eigen::Map<const Eigen::Vector3d>(block + 3);
-    const double angle = w.norm();
-    const Eigen::Matrix3d k = cross(w);
-    // Below, the series is exact to rounding and free of 0 / 0.
-    const bool small = angle < 1e-4;
-    const double a2 = angle * angle;
-    const double a = small ? 1.0 - a2 / 6.0 : std::sin(angle) / angle;
-    const double b = small ? 0.5 - a2 / 24.0 : (1.0 - std::cos(angle)) / a2;
-    const double c = small ? 1.0 / 6.0 - a2 / 120.0 : (angle - std::sin(angle)) / (a2 * angle);
-    R = Eigen::Matrix3d::Identity() + a * k + b * k * k;
-    right_jacobian = Eigen::Matrix3d::Identity() - b * k + c * k * k;
-  }
-};
-
-Vector6d blockOf(const Pose& pose) {
-  const Eigen::AngleAxisd rotation(pose.linear());
-  Vector6d block;
-  block << rotation.angle() * rotation.axis(), pose.translation();
-  return block;
-}
-
-Pose poseOf(const Vector6d& block) {
-  Pose pose = Pose::Identity();
-  const PoseValue value(block.data());
-  // Re-orthonormalised, since it goes on into files.
-  pose.linear() = Eigen::Quaterniond(value.R).normalized().toRotationMatrix();
-  pose.translation() = value.t;
-  return pose;
-}
 
 /// Everything the residuals of one corner depend on, at the values of one evaluation.
 struct Linearization {
@@ -96,14 +53,14 @@ void linearize(const LensModel& lens, const PoseValue& pose, const PoseValue* ri
   }
   if (!derivatives) return;
   if (rig) {
-    out.d_rig.leftCols<3>() = -d_bearing * rig->R * cross(X) * rig->right_jacobian;
+    out.d_rig.leftCols<3>() = -d_bearing * rig->R * crossMatrix(X) * rig->right_jacobian;
     out.d_rig.rightCols<3>() = d_bearing;
     out.d_point = d_bearing * rig->R;
   } else {
     out.d_point = d_bearing;
   }
   const Jacobian23 d_rotated = out.d_point * pose.R;
-  out.d_pose.leftCols<3>() = -d_rotated * cross(point) * pose.right_jacobian;
+  out.d_pose.leftCols<3>() = -d_rotated * crossMatrix(point) * pose.right_jacobian;
   out.d_pose.rightCols<3>() = out.d_point;
   out.d_k1 = d_rotated.col(2) * corner.bulge[0];
   out.d_k2 = d_rotated.col(2) * corner.bulge[1];

@@ -18,8 +18,8 @@
 namespace omnister::tools {
 
 // One line a subcommand, in the order of --help.
-// (declarations here, table below: kept together so that adding a command touches one place)
 void addCalibrate(CLI::App& app);
+void addCalibrateScan(CLI::App& app);
 void addImport(CLI::App& app);
 void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
@@ -33,6 +33,7 @@ namespace {
 
 constexpr AddCommand kCommands[] = {
     addCalibrate,
+    addCalibrateScan,
     addImport,
     addProject,
     addUnproject,
