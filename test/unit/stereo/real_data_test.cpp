@@ -91,6 +91,39 @@ TEST_P(CarFisheye, PavementIsAPlaneAtTheHeightOfTheCamera) {
   EXPECT_LT(quantile(errors, 0.5), 0.01);
 }
 
+// What a stage is for: more positions of the one camera, all matched at once.
+TEST_P(CarFisheye, FivePositionsTightenThePavement) {
+  if (!test::fs::exists(test::dataFolder("planesweep_car_fisheye"))) {
+    GTEST_SKIP() << "no ../shared/data/planesweep_car_fisheye";
+  }
+  const test::CarSequence car = test::readCarSequence(GetParam().side);
+  const std::size_t middle = 2;
+  const cv::Mat reference = car.image(middle);
+  const cv::Rect pavement(250, 300, 750, 400);
+  const auto measure = [&](const std::vector<std::size_t>& others) {
+    StereoGeometry geometry;
+    geometry.reference_lens = car.lens.lens;
+    geometry.reference_size = car.size;
+    std::vector<cv::Mat> displaced;
+    for (std::size_t other : others) {
+      geometry.displaced.push_back({car.lens.lens, car.size, car.T_ref_disp(middle, other)});
+      displaced.push_back(car.image(other));
+    }
+    MatcherOptions options;
+    options.min_range = 0.6;
+    const MatchResult match = makeMatcher("sweep", geometry, options)->match(reference, displaced);
+    const PlaneFit fit = fitPlane(makeCloud(match, *car.lens.lens, reference).xyz(pavement));
+    std::cout << GetParam().side << ", " << others.size() + 1 << " frames: height " << fit.distance
+              << " m, median range error " << 100.0 * fit.all.median_range_error << " %, "
+              << fit.all.points << " of " << pavement.area() << '\n';
+    return fit;
+  };
+  const PlaneFit two = measure({middle + 1});
+  const PlaneFit five = measure({middle - 2, middle - 1, middle + 1, middle + 2});
+  EXPECT_LT(five.all.median_range_error, 0.9 * two.all.median_range_error);
+  EXPECT_GE(five.all.points, two.all.points);
+}
+
 INSTANTIATE_TEST_SUITE_P(, CarFisheye,
                          ::testing::Values(CarCase{"left", 0.932, 0.03},
                                            CarCase{"right", 0.887, 0.015}),
