@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Grids of dots, by OpenCV's blob detector and grid finder; centres are measured again at full
 // size.
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 #include <opencv2/calib3d.hpp>
@@ -65,12 +66,65 @@ std::optional<std::vector<cv::Point2f>> orderDots(std::vector<cv::Point2f> dots,
   return dots;
 }
 
+// The dots as a pinhole camera turned towards them would see them, through an equidistant fisheye
+// of the given half field over the longer side. Rough as that is, it straightens rows enough for
+// the finder, which follows only those that a homography can make straight.
+std::optional<std::vector<cv::Point2f>> flattened(const std::vector<cv::Point2f>& dots,
+                                                  const cv::Size& size, double half_field) {
+  const double focal = 0.5 * std::max(size.width, size.height) / half_field;
+  const Eigen::Vector2d middle(0.5 * size.width, 0.5 * size.height);
+  std::vector<Eigen::Vector3d> rays;
+  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+  for (const cv::Point2f& dot : dots) {
+    const Eigen::Vector2d off = Eigen::Vector2d(dot.x, dot.y) - middle;
+    const double angle = off.norm() / focal;
+    const Eigen::Vector2d side = off.normalized() * std::sin(angle);
+    rays.emplace_back(side.x(), side.y(), std::cos(angle));
+    sum += rays.back();
+  }
+  const Eigen::Quaterniond turn = Eigen::Quaterniond::FromTwoVectors(sum, Eigen::Vector3d::UnitZ());
+  std::vector<cv::Point2f> flat;
+  for (const Eigen::Vector3d& ray : rays) {
+    const Eigen::Vector3d seen = turn * ray;
+    if (seen.z() < 0.1) return std::nullopt;
+    flat.emplace_back(static_cast<float>(focal * seen.x() / seen.z()),
+                      static_cast<float>(focal * seen.y() / seen.z()));
+  }
+  return flat;
+}
+
+// Indices of the dots of the grid, row by row.
+std::vector<std::size_t> findGrid(const std::vector<cv::Point2f>& dots, const Target& target,
+                                  int flags) {
+  const cv::Size pattern(target.cols, target.rows);
+  std::vector<cv::Point2f> centres;
+  try {
+    if (!cv::findCirclesGrid(dots, pattern, centres, flags, cv::Ptr<cv::FeatureDetector>()) ||
+        centres.size() != static_cast<std::size_t>(pattern.area())) {
+      return {};
+    }
+  } catch (const cv::Exception&) {
+    return {};  // it asserts where it finds no homography
+  }
+  std::vector<std::size_t> indices;
+  for (const cv::Point2f& centre : centres) {
+    const auto nearest =
+        std::min_element(dots.begin(), dots.end(), [&](const cv::Point2f& a, const cv::Point2f& b) {
+          return cv::norm(a - centre) < cv::norm(b - centre);
+        });
+    indices.push_back(nearest - dots.begin());
+  }
+  std::vector<std::size_t> sorted = indices;
+  std::sort(sorted.begin(), sorted.end());
+  if (std::adjacent_find(sorted.begin(), sorted.end()) != sorted.end()) return {};
+  return indices;
+}
+
 }  // namespace
 
 std::vector<Corner> detectCircles(const GrayImage& image, const Target& target,
                                   const Budget& budget) {
-  const cv::Size pattern(target.cols, target.rows);
-  const auto expected_dots = static_cast<std::size_t>(pattern.area());
+  const std::size_t expected_dots = static_cast<std::size_t>(target.cols) * target.rows;
   std::vector<double> scales;
   for (const double pixels : {0.5e6, 1.6e6, 0.2e6, 4e6}) {
     const double scale =
@@ -83,31 +137,30 @@ std::vector<Corner> detectCircles(const GrayImage& image, const Target& target,
     const std::vector<cv::Point2f> dots = findDots(copy.image);
     // The finder's time grows with a high power of the number of dots.
     if (dots.size() < expected_dots || dots.size() > 4 * expected_dots + 100) continue;
-    for (const int method : {0, static_cast<int>(cv::CALIB_CB_CLUSTERING)}) {
-      if (budget.spent()) break;
-      const int flags =
-          method | (target.asymmetric ? cv::CALIB_CB_ASYMMETRIC_GRID : cv::CALIB_CB_SYMMETRIC_GRID);
-      std::vector<cv::Point2f> centres;
-      try {
-        if (!cv::findCirclesGrid(dots, pattern, centres, flags, cv::Ptr<cv::FeatureDetector>()) ||
-            centres.size() != expected_dots) {
-          continue;
+    const int grid = target.asymmetric ? cv::CALIB_CB_ASYMMETRIC_GRID : cv::CALIB_CB_SYMMETRIC_GRID;
+    // Half fields over the longer side, 0 for the dots as they are.
+    for (const double half_field : {0.0, 1.6, 1.2, 0.8}) {
+      const auto seen =
+          half_field > 0.0 ? flattened(dots, copy.image.size(), half_field) : std::optional(dots);
+      if (!seen) continue;
+      for (const int method : {0, static_cast<int>(cv::CALIB_CB_CLUSTERING)}) {
+        if (budget.spent()) break;
+        std::vector<cv::Point2f> centres;
+        for (const std::size_t index : findGrid(*seen, target, grid | method)) {
+          centres.push_back(copy.toOriginal(dots[index]));
         }
-      } catch (const cv::Exception&) {
-        continue;  // it asserts where it finds no homography
+        if (centres.size() != expected_dots) continue;
+        const auto ordered = orderDots(centres, target);
+        if (!ordered) continue;
+        Measured coarse;
+        for (const cv::Point2f& c : *ordered) coarse.emplace_back(Eigen::Vector2d(c.x, c.y));
+        const Measured measured = measurePoints(image.fine, target, framesFromGrid(coarse, target));
+        std::vector<Corner> corners;
+        for (std::size_t id = 0; id < measured.size(); ++id) {
+          if (measured[id]) corners.push_back({static_cast<int>(id), *measured[id]});
+        }
+        if (10 * corners.size() >= 9 * expected_dots) return corners;
       }
-      for (cv::Point2f& centre : centres) centre = copy.toOriginal(centre);
-      const auto ordered = orderDots(centres, target);
-      if (!ordered) continue;
-      Measured coarse;
-      for (const cv::Point2f& centre : *ordered)
-        coarse.emplace_back(Eigen::Vector2d(centre.x, centre.y));
-      const Measured measured = measurePoints(image.fine, target, framesFromGrid(coarse, target));
-      std::vector<Corner> corners;
-      for (std::size_t id = 0; id < measured.size(); ++id) {
-        if (measured[id]) corners.push_back({static_cast<int>(id), *measured[id]});
-      }
-      if (10 * corners.size() >= 9 * expected_dots) return corners;
     }
   }
   return {};

@@ -145,8 +145,6 @@ ViewDetections renumbered(const ViewDetections& view, const Target& target, cons
 // detector, would say how near an edge can be told.
 const std::vector<Placement> kWhole{
     {10, 30, 0.35, 35, 20}, {50, 200, 0.34, -30, 10}, {68, 340, 0.36, 20, 75}};
-// As far out as OpenCV's grid finder follows bent rows.
-const std::vector<Placement> kDots{kWhole[0], kWhole[1]};
 // Cut off by the picture's rim.
 const std::vector<Placement> kCut{{78, 170, 0.26, 0, 8}};
 
@@ -249,7 +247,7 @@ TEST(RenderedBoard, AprilGridWithJoiningSquares) {
 // Without a lens, a dot's centroid is not the image of its centre: a tenth of a pixel or two.
 TEST(RenderedBoard, Circles) {
   const Target target = make("{type: circles, cols: 7, rows: 6, square_m: 0.035}");
-  expectWhole(run(target, kDots, "circles"), kDots.size(), 0.2, 0.015);
+  expectWhole(run(target, kWhole, "circles"), kWhole.size(), 0.2, 0.015);
 }
 
 TEST(RenderedBoard, AsymmetricCircles) {
