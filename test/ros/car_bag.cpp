@@ -82,11 +82,13 @@ int main(int argc, char** argv) {
     std::cerr << "usage: car_bag left|right OUT.bag" << std::endl;
     return 2;
   }
-  if (!std::filesystem::exists(omnister::test::dataFolder("planesweep_car_fisheye"))) {
-    std::cerr << "skipped: ../shared/data/planesweep_car_fisheye is not there" << std::endl;
-    return 77;
-  }
   try {
+    if (!std::filesystem::exists(omnister::test::dataFolder("planesweep_car_fisheye"))) {
+      std::cout << "no ../shared/data/planesweep_car_fisheye: " << argv[2] << " is empty"
+                << std::endl;
+      rosbag::Bag(argv[2], rosbag::bagmode::Write).close();
+      return 0;
+    }
     omnister::make(argv[1], argv[2]);
   } catch (const std::exception& e) {
     std::cerr << "car_bag: " << e.what() << std::endl;

@@ -15,9 +15,9 @@ namespace omnister {
 struct CollectorOptions {
   double min_move = 0.02;  ///< corners of a new view lie this far from those of every other, on
                            ///< average, as a share of the image's diagonal
-  double still_px = 2.0;  ///< corners moved less than this since the image before, on average [px]
-  int rings = 4;          ///< of the coverage, by radius from the image's centre to its corner
-  int sectors = 12;       ///< of the coverage, by angle
+  double still_px = 2.0;   ///< corners moved less than this since the image before, on average [px]
+  int rings = 4;           ///< of the coverage, by radius from the image's centre to its corner
+  int sectors = 12;        ///< of the coverage, by angle
 };
 
 /// Looks at detections one by one. Not thread-safe.
