@@ -76,7 +76,8 @@ CalibrationServer::CalibrationServer(const ros::NodeHandle& node,
       transport_(node_),
       diagnostics_(node, private_node) {
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
-  coverage_publisher_ = node_.advertise<sensor_msgs::Image>("coverage", 1);
+  // Latched: the last picture stays to be seen.
+  coverage_publisher_ = node_.advertise<sensor_msgs::Image>("coverage", 1, true);
   mover_ = std::make_unique<Mover>(node_, "move_stage", true);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("calibration", this, &CalibrationServer::diagnose);
@@ -244,6 +245,7 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
 
   Detections detections;
   std::string frame_id;
+  cv::Mat picture;
   {
     std::lock_guard<std::mutex> lock(mutex_);
     if (!enough) {
@@ -256,7 +258,9 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
     }
     detections = collector_->detections();
     frame_id = frame_id_;
+    picture = collector_->draw();
   }
+  publishCoverage(picture, frame_id, ros::Time::now());
 
   feedback("fitting");
   const LensStore store(parameters_.store);
@@ -357,9 +361,14 @@ void CalibrationServer::look(const sensor_msgs::ImageConstPtr& image) {
     if (coverage_publisher_.getNumSubscribers() > 0) picture = collector_->draw();
   }
   progress_.notify_all();
-  if (picture.empty()) return;
+  if (!picture.empty()) publishCoverage(picture, image->header.frame_id, image->header.stamp);
+}
+
+void CalibrationServer::publishCoverage(const cv::Mat& picture, const std::string& frame_id,
+                                        const ros::Time& stamp) {
   const sensor_msgs::ImagePtr message = toImage(picture, sensor_msgs::image_encodings::BGR8);
-  message->header = image->header;
+  message->header.frame_id = frame_id;
+  message->header.stamp = stamp;
   coverage_publisher_.publish(message);
 }
 

@@ -155,6 +155,7 @@ std::optional<FrameSet> FramePairing::makeSet() {
     }
     const Pose T_ref_disp = T_ref_fixed * frame->T_fixed_camera;
     const double baseline = T_ref_disp.translation().norm();
+    if (baseline <= options_.settle_distance) continue;  // the same place
     if (baseline < options_.min_baseline || baseline > options_.max_baseline) {
       if (!(std::abs(baseline - options_.min_baseline) >
             std::abs(nearest_miss - options_.min_baseline)))

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/ros/sim_rig.h"
 
-#include <algorithm>
 #include <vector>
 
 #include "omnister/ros/conversions.h"
@@ -36,7 +35,6 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
   p.scene = source.text("scene", "");
   p.lens = source.text("lens", "");
   p.boards = source.text("boards", "");
-  p.board_hold_s = source.number("board_hold", p.board_hold_s, 0.01, 3600.0, "s");
   p.camera_pose = source.pose("camera_pose", p.camera_pose);
   p.stage.travel_m = source.number("travel", p.stage.travel_m, 1e-3, 100.0, "m");
   p.stage.max_speed_mps = source.number("max_speed", p.stage.max_speed_mps, 1e-6, 100.0, "m/s");
@@ -59,7 +57,7 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
 
 SimRig::SimRig(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
                const SimRigParameters& parameters)
-    : board_since_(std::make_shared<std::atomic<std::int64_t>>(0)),
+    : board_(std::make_shared<std::atomic<int>>(-1)),
       stage_(std::make_shared<sim::SimulatedStage>(parameters.stage)) {
   const sim::ScenePtr scene = sim::readScene(parameters.scene);
   std::vector<sim::ScenePtr> with_board;
@@ -92,23 +90,21 @@ SimRig::SimRig(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
     return T_world_base * Eigen::Translation3d(axis * stage->truePosition(time)) *
            T_carriage_optical;
   };
-  const sim::SceneAt scene_at = [scene, with_board, since = board_since_,
-                                 hold = parameters.board_hold_s](device::Stamp time) {
-    const std::int64_t begin = since->load();
-    if (begin == 0 || with_board.empty()) return scene;
-    const double shown = 1e-9 * static_cast<double>(time.time_since_epoch().count() - begin);
-    return with_board[static_cast<std::size_t>(std::max(0.0, shown / hold)) % with_board.size()];
+  const sim::SceneAt scene_at = [scene, with_board, board = board_](device::Stamp) {
+    const int pose = board->load();
+    return pose < 0 ? scene : with_board[static_cast<std::size_t>(pose)];
   };
   if (!with_board.empty()) {
     using Request = std_srvs::SetBool::Request;
     using Response = std_srvs::SetBool::Response;
     ros::NodeHandle service_node = private_node;
     show_board_ = service_node.advertiseService<Request, Response>(
-        "show_board",
-        [since = board_since_, poses = with_board.size()](Request& request, Response& response) {
-          since->store(request.data ? device::now().time_since_epoch().count() : 0);
+        "show_board", [board = board_, poses = static_cast<int>(with_board.size()), next = 0](
+                          Request& request, Response& response) mutable {
+          board->store(request.data ? next : -1);
+          response.message = request.data ? "pose " + std::to_string(next) : "gone";
+          next = request.data ? (next + 1) % poses : 0;
           response.success = true;
-          response.message = request.data ? std::to_string(poses) + " poses" : "gone";
           return true;
         });
   }

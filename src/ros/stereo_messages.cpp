@@ -6,6 +6,9 @@
 #include <boost/make_shared.hpp>
 #include <cstring>
 #include <limits>
+#include <string>
+
+#include "omnister/common/error.h"
 
 namespace omnister {
 namespace {
@@ -77,6 +80,46 @@ sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Hea
     }
   }
   return message;
+}
+
+Cloud fromPointCloud(const sensor_msgs::PointCloud2& message) {
+  const auto refuse = [](const std::string& field, const std::string& problem) {
+    throw InputError("cloud message", field, problem);
+  };
+  constexpr std::uint64_t kMostPoints = 100u << 20;
+  const std::uint64_t points = static_cast<std::uint64_t>(message.width) * message.height;
+  if (points == 0 || points > kMostPoints)
+    refuse("size", "is " + std::to_string(message.width) + "x" + std::to_string(message.height));
+  if (message.is_bigendian != kBigEndian) refuse("is_bigendian", "is not this machine's");
+  if (message.point_step != sizeof(Point) ||
+      message.row_step != static_cast<std::uint64_t>(message.point_step) * message.width ||
+      message.data.size() != points * sizeof(Point))
+    refuse("data", "does not agree with width, height and a step of 24 bytes a point");
+  const char* const names[] = {"x", "y", "z", "rgb", "sigma", "score"};
+  if (message.fields.size() != 6) refuse("fields", "are not x y z rgb sigma score");
+  for (std::size_t i = 0; i < 6; ++i) {
+    const sensor_msgs::PointField& field = message.fields[i];
+    if (field.name != names[i] || field.offset != i * sizeof(float) ||
+        field.datatype != sensor_msgs::PointField::FLOAT32 || field.count != 1)
+      refuse("fields", "are not x y z rgb sigma score of float32");
+  }
+  const cv::Size size(static_cast<int>(message.width), static_cast<int>(message.height));
+  Cloud cloud{cv::Mat(size, CV_32FC3), cv::Mat(size, CV_8UC3), cv::Mat(size, CV_32FC1),
+              cv::Mat(size, CV_32FC1)};
+  const std::uint8_t* in = message.data.data();
+  for (int v = 0; v < size.height; ++v) {
+    for (int u = 0; u < size.width; ++u, in += sizeof(Point)) {
+      Point point{};
+      std::memcpy(&point, in, sizeof point);
+      cloud.xyz.at<cv::Vec3f>(v, u) = {point.x, point.y, point.z};
+      cloud.bgr.at<cv::Vec3b>(v, u) = {static_cast<std::uint8_t>(point.rgb),
+                                       static_cast<std::uint8_t>(point.rgb >> 8),
+                                       static_cast<std::uint8_t>(point.rgb >> 16)};
+      cloud.sigma.at<float>(v, u) = point.sigma;
+      cloud.score.at<float>(v, u) = point.score;
+    }
+  }
+  return cloud;
 }
 
 sensor_msgs::ImagePtr toDepth(const Cloud& cloud, const std_msgs::Header& header) {

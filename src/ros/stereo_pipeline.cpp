@@ -84,6 +84,8 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   result.matching.max_range = parameters.number("max_range", 50.0, 1e-3, 1e4, "m");
   result.matching.hypotheses = parameters.integer("hypotheses", 0, 0, 4096);
   result.matching.threads = parameters.integer("threads", 0, 0, 256);
+  const double rate = parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)");
+  result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
   result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
   if (result.matching.max_range <= result.matching.min_range)
     throw InputError("~max_range", "", "is not larger than ~min_range");
@@ -350,6 +352,8 @@ std::optional<StereoPipeline::Job> StereoPipeline::nextJob() {
   if (!stopping_ && !rig_job_)
     wake_.wait_for(lock, std::chrono::milliseconds(pairing_.waiting() ? 10 : 200));
   if (stopping_) return std::nullopt;
+  // A set that came too early is not lost: the newest one is taken when it is time.
+  if ((ros::SteadyTime::now() - last_start_).toSec() < parameters_.min_period) return std::nullopt;
   if (parameters_.rig) {
     std::optional<Job> job = std::move(rig_job_);
     rig_job_.reset();
@@ -429,6 +433,7 @@ void StereoPipeline::process(const Job& job) {
   std::vector<LensFile> lenses;
   {
     std::lock_guard<std::mutex> lock(mutex_);
+    last_start_ = start;
     for (const Eye& eye : eyes_)
       if (eye.lens) lenses.push_back(*eye.lens);
   }

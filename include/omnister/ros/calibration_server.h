@@ -44,8 +44,9 @@ struct CalibrationParameters {
 CalibrationParameters loadCalibrationParameters(Parameters& parameters);
 
 /// Action `calibrate`. Subscribes to `image_raw` only while it runs. Publishes `coverage` (while
-/// somebody listens) and latched `lens_model`. Views go to `<store>/<camera_name>_detections.csv`
-/// before the fit, the lens to `<store>/<camera_name>.yaml`; both whole or not at all.
+/// somebody listens, and once more when all views are there) and latched `lens_model`. Views go to
+/// `<store>/<camera_name>_detections.csv` before the fit, the lens to `<store>/<camera_name>.yaml`;
+/// both whole or not at all.
 class CalibrationServer {
  public:
   /// Returns at once. @throws Error for parameters that do not hold
@@ -70,6 +71,7 @@ class CalibrationServer {
   void onImage(const sensor_msgs::ImageConstPtr& image);
   void run();
   void look(const sensor_msgs::ImageConstPtr& image);
+  void publishCoverage(const cv::Mat& picture, const std::string& frame_id, const ros::Time& stamp);
   void publishLens(const LensFile& file, const std::string& frame_id);
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 

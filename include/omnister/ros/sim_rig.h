@@ -7,15 +7,14 @@
 /// the simulation from `~…`. Note that `~lens` is the lens that the camera truly has; what its
 /// driver knows of it is `~camera/lens`, nothing by default.
 ///
-/// With `~boards`, the service `~show_board` (std_srvs/SetBool) begins and ends the carrying of a
-/// calibration board before the camera, as a person would: it rests at one pose after the other.
+/// With `~boards`, the service `~show_board` (std_srvs/SetBool) carries a calibration board before
+/// the camera, as a person would: true shows it at its next pose, false takes it away.
 #pragma once
 
 #include <ros/node_handle.h>
 #include <std_srvs/SetBool.h>
 
 #include <atomic>
-#include <cstdint>
 #include <memory>
 #include <string>
 
@@ -29,10 +28,9 @@ namespace omnister {
 
 /// Private parameters of the same names.
 struct SimRigParameters {
-  std::string scene;          ///< scene file
-  std::string lens;           ///< lens file: the true lens and its image size
-  std::string boards;         ///< scene file that lists the poses of the board; may be empty
-  double board_hold_s = 1.0;  ///< at each pose
+  std::string scene;   ///< scene file
+  std::string lens;    ///< lens file: the true lens and its image size
+  std::string boards;  ///< scene file that lists the poses of the board; may be empty
   Pose camera_pose = Pose::Identity();  ///< T_world_optical at stage position 0
   sim::SimulatedStageOptions
       stage;                   ///< travel, max_speed, acceleration, homing_speed, start, homed
@@ -51,8 +49,8 @@ class SimRig {
          const SimRigParameters& parameters);
 
  private:
-  /// When the board came in [ns since the epoch]; 0: it is not there.
-  std::shared_ptr<std::atomic<std::int64_t>> board_since_;
+  /// Pose of the board that is seen; negative: it is not there.
+  std::shared_ptr<std::atomic<int>> board_;
   ros::ServiceServer show_board_;
   std::shared_ptr<sim::SimulatedStage> stage_;
   std::unique_ptr<StageDriver> stage_driver_;

@@ -13,6 +13,10 @@ namespace omnister {
 /// sigma [m], score (0 to 1), all float32; NaN where invalid (REP 117). is_dense is false.
 sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Header& header);
 
+/// The inverse of toPointCloud(), for clouds of that layout.
+/// @throws InputError naming the field that is missing or does not agree with the data
+Cloud fromPointCloud(const sensor_msgs::PointCloud2& message);
+
 /// 32FC1 [m]: distance along z (REP 118), NaN for rays at or past 90 degrees and where invalid.
 sensor_msgs::ImagePtr toDepth(const Cloud& cloud, const std_msgs::Header& header);
 

@@ -39,6 +39,7 @@ struct StereoParameters {
   std::string fixed_frame = "stage_base";  ///< stage: camera poses are taken in this tf frame
   PairingOptions pairing;
   double max_skew = 0.02;   ///< rig: between the stamps of left and right [s]
+  double min_period = 0.0;  ///< between the beginnings of two matches [s]; of `max_rate`
   MatcherOptions matching;  ///< with the mask
   std::string matcher = "sweep";
 };
@@ -125,6 +126,7 @@ class StereoPipeline {
   std::map<std::string, ros::SteadyTime> warned_;
   std::string reason_ = "no image yet";
   std::size_t clouds_ = 0;
+  ros::SteadyTime last_start_;  ///< of a match
   ros::SteadyTime last_cloud_;  ///< or since when somebody listens
   MatchStatistics last_statistics_;
   double last_seconds_ = 0.0;

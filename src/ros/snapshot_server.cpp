@@ -1,0 +1,90 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "omnister/ros/snapshot_server.h"
+
+#include <message_filters/subscriber.h>
+#include <message_filters/time_synchronizer.h>
+#include <ros/callback_queue.h>
+#include <sensor_msgs/Image.h>
+#include <sensor_msgs/PointCloud2.h>
+#include <sensor_msgs/image_encodings.h>
+
+#include <opencv2/core.hpp>
+
+#include "omnister/common/error.h"
+#include "omnister/ros/conversions.h"
+#include "omnister/ros/parameters.h"
+#include "omnister/ros/stereo_messages.h"
+#include "omnister/stereo/cloud.h"
+
+namespace omnister {
+
+SnapshotServer::SnapshotServer(const ros::NodeHandle& node, const ros::NodeHandle& private_node)
+    : node_(node) {
+  Parameters parameters(private_node);
+  cloud_path_ = parameters.text("cloud", "cloud.ply");
+  range_path_ = parameters.text("range", "range.tiff");
+  timeout_ = parameters.number("timeout", timeout_, 0.1, 3600.0, "s");
+  parameters.warnUnknown();
+  checkCloudPath(cloud_path_);
+  checkRangePath(range_path_);
+  ros::NodeHandle service_node = private_node;
+  service_ = service_node.advertiseService("save", &SnapshotServer::onSave, this);
+}
+
+bool SnapshotServer::onSave(std_srvs::Trigger::Request&, std_srvs::Trigger::Response& response) {
+  try {
+    response.message = save();
+    response.success = true;
+  } catch (const std::exception& error) {
+    response.message = printable(error.what(), 500);
+    response.success = false;
+  }
+  return true;
+}
+
+std::string SnapshotServer::save() const {
+  // A queue of its own: the service waits here while the messages come in.
+  ros::CallbackQueue queue;
+  ros::NodeHandle node(node_);
+  node.setCallbackQueue(&queue);
+  message_filters::Subscriber<sensor_msgs::PointCloud2> points(node, "points2", 2);
+  message_filters::Subscriber<sensor_msgs::Image> ranges(node, "range", 2);
+  message_filters::TimeSynchronizer<sensor_msgs::PointCloud2, sensor_msgs::Image> pairs(points,
+                                                                                        ranges, 4);
+  sensor_msgs::PointCloud2ConstPtr cloud_message;
+  sensor_msgs::ImageConstPtr range_message;
+  const auto take = [&](const sensor_msgs::PointCloud2ConstPtr& cloud,
+                        const sensor_msgs::ImageConstPtr& range) {
+    cloud_message = cloud;
+    range_message = range;
+  };
+  pairs.registerCallback(
+      boost::bind<void>(take, boost::placeholders::_1, boost::placeholders::_2));
+  const ros::SteadyTime start = ros::SteadyTime::now();
+  while (ros::ok() && !cloud_message) {
+    queue.callAvailable(ros::WallDuration(0.05));
+    if ((ros::SteadyTime::now() - start).toSec() > timeout_)
+      throw Error("no cloud with a range image on " + points.getTopic() + " and " +
+                  ranges.getTopic() + " within " + std::to_string(static_cast<int>(timeout_)) +
+                  " s");
+  }
+  if (!cloud_message) throw Error("the node goes down");
+
+  const Cloud cloud = fromPointCloud(*cloud_message);
+  checkImage(*range_message);
+  if (range_message->encoding != sensor_msgs::image_encodings::TYPE_32FC1)
+    throw InputError(ranges.getTopic(), "encoding",
+                     "is '" + printable(range_message->encoding) + "', expected 32FC1");
+  const cv::Mat range(static_cast<int>(range_message->height),
+                      static_cast<int>(range_message->width), CV_32FC1,
+                      const_cast<std::uint8_t*>(range_message->data.data()), range_message->step);
+  const auto cloud_file = stageCloud(cloud_path_, cloud);
+  const auto range_file = stageRange(range_path_, range);
+  cloud_file->commit();
+  range_file->commit();
+  const int points_seen = cv::countNonZero(range == range);  // NaN is not equal to itself
+  return std::to_string(points_seen) + " points of " + std::to_string(cloud.xyz.total()) +
+         " pixels";
+}
+
+}  // namespace omnister
