@@ -7,6 +7,7 @@
 #include <chrono>
 #include <cmath>
 #include <opencv2/imgcodecs.hpp>
+#include <utility>
 
 #include "omnister/common/error.h"
 #include "omnister/ros/conversions.h"
@@ -210,7 +211,7 @@ void StereoPipeline::unsubscribe() {
   subscribed_ = false;
   std::lock_guard<std::mutex> lock(mutex_);
   pairing_.reset("nobody listens");
-  rig_job_.reset();
+  pending_.reset();
 }
 
 void StereoPipeline::drop(const std::string& name, const std::string& reason, bool fault) {
@@ -298,8 +299,7 @@ void StereoPipeline::onImages(const sensor_msgs::ImageConstPtr& left,
   job.T_ref_disp = {*T_left_right};
   {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (rig_job_) ++drops_["busy"];
-    rig_job_ = std::move(job);
+    putPending(std::move(job));
   }
   wake_.notify_all();
 }
@@ -349,22 +349,27 @@ PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t 
 
 std::optional<StereoPipeline::Job> StereoPipeline::nextJob() {
   std::unique_lock<std::mutex> lock(mutex_);
-  if (!stopping_ && !rig_job_)
-    wake_.wait_for(lock, std::chrono::milliseconds(pairing_.waiting() ? 10 : 200));
-  if (stopping_) return std::nullopt;
-  // A set that came too early is not lost: the newest one is taken when it is time.
-  if ((ros::SteadyTime::now() - last_start_).toSec() < parameters_.min_period) return std::nullopt;
-  if (parameters_.rig) {
-    std::optional<Job> job = std::move(rig_job_);
-    rig_job_.reset();
-    return job;
+  const auto due_in = [&] {
+    return parameters_.min_period - (ros::SteadyTime::now() - last_start_).toSec();
+  };
+  if (!stopping_ && !(pending_ && due_in() <= 0.0)) {
+    double pause = pairing_.waiting() ? 0.01 : 0.2;
+    if (pending_) pause = std::clamp(due_in(), 0.001, pause);
+    wake_.wait_for(lock, std::chrono::duration<double>(pause));
   }
+  if (stopping_) return std::nullopt;
+  if (!parameters_.rig) pollPairing();
+  if (!pending_ || due_in() > 0.0) return std::nullopt;
+  return std::exchange(pending_, std::nullopt);
+}
+
+void StereoPipeline::pollPairing() {
   const std::optional<FrameSet> set =
       pairing_.poll([this](const std::string& frame_id,
                            std::int64_t stamp) { return cameraPose(frame_id, stamp); },
                     nowNanoseconds());
   if (!pairing_.reason().empty()) reason_ = pairing_.reason();
-  if (!set) return std::nullopt;
+  if (!set) return;
   const auto message = [](const PairingFrame& frame) {
     const std::shared_ptr<const void> held = frame.image;
     return sensor_msgs::ImageConstPtr(static_cast<const sensor_msgs::Image*>(held.get()),
@@ -376,7 +381,12 @@ std::optional<StereoPipeline::Job> StereoPipeline::nextJob() {
     job.displaced.push_back(message(displaced.frame));
     job.T_ref_disp.push_back(displaced.T_ref_disp);
   }
-  return job;
+  putPending(std::move(job));
+}
+
+void StereoPipeline::putPending(Job job) {
+  if (pending_) ++drops_["busy"];
+  pending_ = std::move(job);
 }
 
 void StereoPipeline::run() {

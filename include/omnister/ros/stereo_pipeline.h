@@ -87,6 +87,8 @@ class StereoPipeline {
 
   void run();
   std::optional<Job> nextJob();
+  void pollPairing();        ///< mutex_ is held
+  void putPending(Job job);  ///< mutex_ is held
   void process(const Job& job);
   Matcher& matcherFor(const StereoGeometry& geometry);
   const cv::Mat& raysOf(const LensFile& file);
@@ -121,7 +123,7 @@ class StereoPipeline {
   bool stopping_ = false;
   std::vector<Eye> eyes_;
   FramePairing pairing_;
-  std::optional<Job> rig_job_;
+  std::optional<Job> pending_;  ///< newest set that waits to be matched
   std::map<std::string, std::size_t> drops_;
   std::map<std::string, ros::SteadyTime> warned_;
   std::string reason_ = "no image yet";
