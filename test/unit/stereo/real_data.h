@@ -8,14 +8,15 @@
 #include <fstream>
 #include <map>
 #include <nlohmann/json.hpp>
-#include <opencv2/calib3d.hpp>
 #include <opencv2/imgcodecs.hpp>
+#include <sstream>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
 #include "omnister/common/pose.h"
 #include "omnister/lens/lens_fit.h"
+#include "omnister/lens/lens_import.h"
 #include "omnister/lens/lens_models.h"
 
 namespace omnister::test {
@@ -77,16 +78,14 @@ inline CarSequence readCarSequence(const std::string& side, const std::string& m
   // The printed rotation has ten digits; make it a rotation to the last one.
   T_vehicle_camera.linear() = Eigen::Quaterniond(T_vehicle_camera.linear()).normalized().matrix();
 
-  // Mei's model with radial and tangential distortion.
+  // The same numbers as Kalibr writes them, through the product's importer.
+  std::ostringstream camchain;
+  camchain.precision(17);
+  camchain << "cam0:\n  camera_model: omni\n  intrinsics: [" << xi << ", " << fx << ", " << fy
+           << ", " << cx << ", " << cy << "]\n  distortion_model: radtan\n  distortion_coeffs: ["
+           << k1 << ", " << k2 << ", " << p1 << ", " << p2 << "]\n  resolution: [1280, 800]\n";
   sequence.lens =
-      lensThrough(model, {cx, cy}, fx / (1.0 + xi), 1.64, [&](const Eigen::Vector3d& ray) {
-        const double x = ray.x() / (ray.z() + xi), y = ray.y() / (ray.z() + xi);
-        const double r2 = x * x + y * y;
-        const double radial = 1.0 + k1 * r2 + k2 * r2 * r2;
-        const double xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
-        const double yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
-        return Eigen::Vector2d(fx * xd + skew * yd + cx, fy * yd + cy);
-      });
+      fitForeignCamera(readForeignCamera(camchain.str(), "camchain.yaml", "kalibr"), model).fit;
 
   std::map<std::string, Pose> poses;
   std::ifstream pose_file(folder / "system_poses.txt");
