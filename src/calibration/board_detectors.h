@@ -17,7 +17,8 @@ namespace omnister::detect {
 class Budget {
  public:
   explicit Budget(double seconds);
-  bool spent() const;
+  bool spent() const { return left() <= 0.0; }
+  double left() const;  ///< [s]
 
  private:
   double end_;

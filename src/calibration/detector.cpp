@@ -2,6 +2,7 @@
 #include "omnister/calibration/detector.h"
 
 #include <algorithm>
+#include <cstdint>
 #include <exception>
 #include <opencv2/core.hpp>
 
@@ -12,6 +13,20 @@
 
 namespace omnister {
 namespace {
+
+// OpenCV's detectors search with random trees drawn from a generator that each thread carries
+// along: seeded here, what is found in an image does not depend on the images that its thread saw
+// before.
+class SameRandomness {
+ public:
+  SameRandomness() : state_(cv::theRNG().state) { cv::theRNG().state = 0x9E3779B97F4A7C15ull; }
+  ~SameRandomness() { cv::theRNG().state = state_; }
+  SameRandomness(const SameRandomness&) = delete;
+  SameRandomness& operator=(const SameRandomness&) = delete;
+
+ private:
+  std::uint64_t state_;
+};
 
 std::vector<detect::Corner> detectCorners(const detect::GrayImage& image, const Target& target,
                                           const detect::Budget& budget) {
@@ -38,6 +53,7 @@ std::optional<ViewDetections> detectTarget(const cv::Mat& image, const Target& t
   const Eigen::Vector2i grid = targetGrid(target);
   const int smallest = 3 * std::min(grid.x(), grid.y());
   if (gray.eight_bit.cols < smallest || gray.eight_bit.rows < smallest) return std::nullopt;
+  const SameRandomness same;
   const std::vector<detect::Corner> corners =
       detectCorners(gray, target, detect::Budget(options.seconds_per_image));
   if (corners.empty()) return std::nullopt;

@@ -127,6 +127,7 @@ std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& tar
                                        const Budget& budget) {
   std::vector<Attempt> done;
   std::vector<double> done_scales;
+  double cost_of_pixel[2] = {0.0, 0.0};  // [s], of each method
   for (const Attempt& attempt : kAttempts) {
     if (budget.spent()) break;
     const double scale = scaleFor(attempt, image.eight_bit);
@@ -137,6 +138,10 @@ std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& tar
                        std::abs(std::log(scale / done_scales[i])) < std::log(kSameScale));
     }
     if (repeated) continue;
+    // What the same search took in a smaller copy tells what it will take at least.
+    const double pixels = scale * scale * static_cast<double>(image.eight_bit.total());
+    double& cost = cost_of_pixel[attempt.method == Method::kQuads ? 1 : 0];
+    if (cost * pixels > budget.left()) continue;
     done.push_back(attempt);
     done_scales.push_back(scale);
 
@@ -146,7 +151,9 @@ std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& tar
       cv::createCLAHE(4.0, {8, 8})->apply(copy.image, even);
       copy.image = even;
     }
+    const double before = budget.left();
     auto corners = search(copy.image, target, attempt.method);
+    cost = std::max(cost, (before - budget.left()) / pixels);
     if (!corners) continue;
     for (cv::Point2f& corner : *corners) corner = copy.toOriginal(corner);
     auto ordered = orderGrid(*corners, target, &image.fine);

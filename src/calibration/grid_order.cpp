@@ -99,7 +99,7 @@ int firstSquare(const Grid& grid, const cv::Mat& fine) {
 
 Budget::Budget(double seconds) : end_(threadSeconds() + seconds) {}
 
-bool Budget::spent() const { return threadSeconds() >= end_; }
+double Budget::left() const { return end_ - threadSeconds(); }
 
 ScaledImage scaled(const cv::Mat& image, double scale) {
   ScaledImage copy;
