@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sweep_kernels.h"
 
+#include <hwy/cache_control.h>
+
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
-#include <mutex>
 
-#include <hwy/cache_control.h>
-
+#include "omnister/common/error.h"
 #include "sweep_geometry.h"
 
 // The AVX-512 of Ice Lake and Zen 4, with its population count of bytes, is only built when asked
@@ -736,6 +736,28 @@ void medianRow(const float* const rows[3], int count, float* out) {
 void triangulateRow(TriangulateJob* job) { HWY_DYNAMIC_DISPATCH(TriangulateRow)(job); }
 
 void matchChunk(const ChunkJob& job) { HWY_DYNAMIC_DISPATCH(MatchChunk)(job); }
+
+void holdSimd(const std::string& name) {
+  std::int64_t disabled = 0;
+  if (name == "avx2")
+    disabled = HWY_AVX3 | HWY_AVX3_DL;
+  else if (name == "sse4")
+    disabled = HWY_AVX3 | HWY_AVX3_DL | HWY_AVX2;
+  else if (name == "scalar")
+    disabled = ~static_cast<std::int64_t>(HWY_SCALAR | HWY_EMU128);
+  else if (!name.empty() && name != "best")
+    throw Error("OMNISTER_SIMD is '" + printable(name) + "', expected best, avx2, sse4 or scalar");
+  hwy::DisableTargets(disabled);
+}
+
+void holdSimdByEnvironment() {
+  static const bool once = [] {
+    const char* name = std::getenv("OMNISTER_SIMD");
+    if (name && *name) holdSimd(name);
+    return true;
+  }();
+  static_cast<void>(once);
+}
 
 std::string simdName() { return HWY_DYNAMIC_DISPATCH(TargetName)(); }
 

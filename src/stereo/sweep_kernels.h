@@ -172,6 +172,13 @@ void triangulateRow(TriangulateJob* job);
 
 void matchChunk(const ChunkJob& job);
 
+/// Holds the choice to `avx2`, `sse4` or `scalar` at most; `best` lifts that. Not while matching.
+/// @throws Error for another name
+void holdSimd(const std::string& name);
+
+/// holdSimd() by OMNISTER_SIMD, the first time it is called.
+void holdSimdByEnvironment();
+
 /// Name of the instruction set in use.
 std::string simdName();
 

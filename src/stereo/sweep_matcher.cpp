@@ -759,6 +759,7 @@ class PairwiseMatcher : public Matcher {
 std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
                                           const MatcherOptions& options) {
   checkMatching(geometry, options);
+  sweep::holdSimdByEnvironment();
   if (geometry.displaced.size() > 1) return std::make_unique<PairwiseMatcher>(geometry, options);
   return std::make_unique<SweepMatcher>(geometry, options);
 }
