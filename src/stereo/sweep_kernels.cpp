@@ -181,12 +181,13 @@ void CensusRow(const std::uint8_t* const rows[5], int count, std::uint8_t* const
         bits =
             hn::Or(bits, hn::IfThenElseZero(more, hn::Set(d, static_cast<std::uint8_t>(1u << i))));
       }
-      hn::StoreU(bits, d, to + x);
+      // A cell that sees nothing has no structure, lest the edge of the field be matched.
+      hn::StoreU(hn::IfThenZeroElse(hn::Eq(c, hn::Zero(d)), bits), d, to + x);
     }
     for (; x < count; ++x) {
       unsigned bits = 0;
       for (int i = 0; i < 8; ++i) bits |= (neighbour[i][x] > centre[x] ? 1u : 0u) << i;
-      to[x] = static_cast<std::uint8_t>(bits);
+      to[x] = static_cast<std::uint8_t>(centre[x] == 0 ? 0 : bits);
     }
   }
 }

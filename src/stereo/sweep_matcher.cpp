@@ -25,8 +25,10 @@ using namespace sweep;
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 constexpr float kFullCost = kWindow * kWindow * kBits;  ///< every bit of every descriptor wrong
-constexpr int kNarrowLanes = 14;                        ///< hypotheses of the cheapest chunk
-constexpr int kSearchMargin = 3;      ///< columns beyond what the coarser level found
+constexpr int kTileWidth = 96, kTileHeight = 40;
+constexpr float kMiddleX = 48, kMiddleY = 20;  ///< where planes are fitted about
+constexpr int kNarrowLanes = 14;               ///< hypotheses of the cheapest chunk
+constexpr int kSearchMargin = 3;               ///< columns beyond what the coarser level found
 constexpr int kClaimTolerance = 6;    ///< quarters of a column that two claims may differ by
 constexpr int kSpeckle = 100;         ///< regions of fewer pixels go
 constexpr float kWorstShare = 0.36f;  ///< of it, that a match may cost; chance gives a half
@@ -79,7 +81,7 @@ struct Scratch {
 
 /// A plane of one value a pixel; vector code may write up to 64 elements behind the end of a row.
 cv::Mat makePlane(cv::Size size, int type) {
-  const cv::Mat room(size.height, (size.width + 63) / 64 * 64 + 64, type);
+  const cv::Mat room(size.height, (size.width + 63) / 64 * 64 + 64, type, cv::Scalar(-1));
   return room.colRange(0, size.width);
 }
 
@@ -107,7 +109,7 @@ class SweepMatcher : public Matcher {
       Level& level = levels_[l];
       level.map = makeReferenceMap(reference_lens, geometry.reference_size, l, frame_, limits.axis,
                                    options.mask, options.threads);
-      level.layout = makeLayout(level.map, limits, cv::Size(64, 48));
+      level.layout = makeLayout(level.map, limits, cv::Size(kTileWidth, kTileHeight));
       level.grid = makeGrid(&level.layout, level.map, frame_, 1.0, displaced_lens, displaced.size,
                             l, displaced.T_ref_disp.linear(), kRadius, options.threads);
       limits.hypotheses = (limits.hypotheses + 1) / 2;
@@ -269,16 +271,16 @@ class SweepMatcher : public Matcher {
     if (most - least > kNarrowLanes) fitPlane(samples, &guess);
 
     // A few stray pixels do not widen the search; a thin object does.
-    constexpr float kFurthest = 2048;
+    const float furthest = static_cast<float>(levels_[l].slack - 128);  // what may be read
     std::vector<int>& histogram = scratch->histogram;
-    float low = kFurthest, high = -kFurthest;
+    float low = furthest, high = -furthest;
     for (Eigen::Vector3f& s : samples) {
       s.z() -= guess.at + guess.x * s.x() + guess.y * s.y();
       low = std::min(low, s.z());
       high = std::max(high, s.z());
     }
-    const int from = static_cast<int>(std::lround(std::max(low, -kFurthest)));
-    const int bins = static_cast<int>(std::lround(std::min(high, kFurthest))) - from + 1;
+    const int from = static_cast<int>(std::lround(std::max(low, -furthest)));
+    const int bins = static_cast<int>(std::lround(std::min(high, furthest))) - from + 1;
     histogram.assign(bins + 2, 0);
     for (const Eigen::Vector3f& s : samples)
       ++histogram[1 + std::clamp(static_cast<int>(std::lround(s.z())) - from, 0, bins - 1)];
@@ -307,7 +309,7 @@ class SweepMatcher : public Matcher {
       Eigen::Matrix3f A = Eigen::Matrix3f::Zero();
       Eigen::Vector3f b = Eigen::Vector3f::Zero();
       for (std::size_t i = 0; i < samples.size(); i += stride) {
-        const Eigen::Vector3f row(samples[i].x() - 32, samples[i].y() - 24, 1);
+        const Eigen::Vector3f row(samples[i].x() - kMiddleX, samples[i].y() - kMiddleY, 1);
         const float error = samples[i].z() - plane.dot(row);
         const float scale = iteration == 1 ? 6.0f : 2.0f;
         const float weight = iteration == 0 ? 1.0f : 1 / (1 + error * error / (scale * scale));
@@ -320,7 +322,7 @@ class SweepMatcher : public Matcher {
     }
     guess->x = plane.x();
     guess->y = plane.y();
-    guess->at = plane.z() - 32 * plane.x() - 24 * plane.y();
+    guess->at = plane.z() - kMiddleX * plane.x() - kMiddleY * plane.y();
   }
 
   void matchLevel(std::size_t l) {

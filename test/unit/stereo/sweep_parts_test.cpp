@@ -1,0 +1,341 @@
+// SPDX-License-Identifier: Apache-2.0
+/// The sweep's parts against slow, plain versions of themselves.
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <deque>
+#include <limits>
+#include <opencv2/core.hpp>
+#include <random>
+
+#include "omnister/common/error.h"
+#include "omnister/lens/lens_models.h"
+#include "stereo/sweep_filters.h"
+#include "stereo/sweep_geometry.h"
+#include "stereo/sweep_kernels.h"
+
+namespace omnister::sweep {
+namespace {
+
+constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
+
+LensPtr wideLens(cv::Size size, double half_field) {
+  LensStructure structure;
+  structure.model = "spline";
+  return makeLens(structure, {0.5 * size.width, 0.5 * size.height}, 0.5 * size.width / half_field,
+                  half_field);
+}
+
+TEST(SweepGeometry, InterpolatedMapIsTheLens) {
+  const cv::Size size(260, 200);
+  for (const double half : {1.2, 1.9}) {
+    for (const Eigen::Vector3d& t :
+         {Eigen::Vector3d(0.2, 0, 0), Eigen::Vector3d(0.02, -0.01, 0.3)}) {
+      for (const Axis axis : {Axis::kAngle, Axis::kInverse}) {
+        const LensPtr lens = wideLens(size, half);
+        const EpipolarFrame frame = makeEpipolarFrame(t);
+        EXPECT_NEAR((frame.basis * frame.basis.transpose() - Eigen::Matrix3d::Identity()).norm(), 0,
+                    1e-12);
+        const ReferenceMap map = makeReferenceMap(widen(lens), size, 0, frame, axis, cv::Mat(), 2);
+        int checked = 0;
+        for (int y = 0; y < size.height; ++y) {
+          for (int x = 0; x < size.width; ++x) {
+            const std::size_t i = static_cast<std::size_t>(y) * size.width + x;
+            const auto ray = lens->unproject(Eigen::Vector2d(x, y));
+            if (!ray) {
+              EXPECT_EQ(map.phi[i], kNoRay);
+              continue;
+            }
+            const Eigen::Vector3d b = frame.basis * *ray;
+            const double radius = std::hypot(b.y(), b.z());
+            if (radius < 0.03) continue;
+            if (map.phi[i] == kNoRay) {
+              // Only at the very rim may rounding leave a pixel out.
+              EXPECT_GT(std::acos(ray->z()), half - 1e-4);
+              continue;
+            }
+            ++checked;
+            const double theta = std::atan2(radius, b.x());
+            ASSERT_NEAR(thetaOf(axis, map.a[i]), theta, 1e-4) << x << " " << y;
+            double turn = map.phi[i] / kPhiUnits - M_PI - std::atan2(b.z(), b.y());
+            turn -= 2 * M_PI * std::round(turn / (2 * M_PI));
+            ASSERT_NEAR(turn, 0, 2e-4 / radius) << x << " " << y;
+          }
+        }
+        EXPECT_GT(checked, 30000);
+      }
+    }
+  }
+}
+
+TEST(SweepGeometry, NodesLieWhereTheLensPutsThem) {
+  const cv::Size size(260, 220);
+  const LensPtr lens = wideLens(size, 1.7);
+  const Eigen::Matrix3d R =
+      Eigen::AngleAxisd(0.2, Eigen::Vector3d(0.1, 1, 0.3).normalized()).toRotationMatrix();
+  const Eigen::Vector3d t(0.1, 0.02, 0.04);
+  const EpipolarFrame frame = makeEpipolarFrame(t);
+  const WideLens wide = widen(lens);
+  const ReferenceMap map = makeReferenceMap(wide, size, 0, frame, Axis::kAngle, cv::Mat(), 1);
+  HypothesisLimits limits;
+  limits.baseline = frame.baseline;
+  Layout layout = makeLayout(map, limits, cv::Size(64, 48));
+  const Grid grid = makeGrid(&layout, map, frame, 1.0, wide, size, 0, R, kRadius, 2);
+  int checked = 0, seen = 0;
+  for (const Band& band : grid.bands) {
+    for (int r = 0; r < band.rows; r += 3) {
+      for (int n = 0; n < band.runs[r]; ++n) {
+        const std::uint8_t mask = grid.mask[(band.origin[r] + band.begin[r]) / 8 + n];
+        for (int i = 0; i < 8; i += 3) {
+          const double theta = (band.begin[r] + n * 8 + i) * band.step_h;
+          const double phi = (r - band.row_offset) * band.step_phi - M_PI;
+          const Eigen::Vector3d ray =
+              R.transpose() * frame.basis.transpose() *
+              Eigen::Vector3d(std::cos(theta), std::sin(theta) * std::cos(phi),
+                              std::sin(theta) * std::sin(phi));
+          const auto pixel = lens->project(ray);
+          const bool inside = pixel && pixel->x() > 0 && pixel->y() > 0 &&
+                              pixel->x() < size.width - 1 && pixel->y() < size.height - 1;
+          ++checked;
+          if (!(mask >> i & 1)) {
+            // Off the image, or within half a pixel of its edge.
+            EXPECT_TRUE(!inside || theta < 0 || theta > M_PI) << r << " " << n << " " << i;
+            continue;
+          }
+          ++seen;
+          ASSERT_TRUE(pixel);
+          const double x =
+              grid.x[band.node[r] + n] * (1 - i / 8.0) + grid.x[band.node[r] + n + 1] * i / 8.0;
+          const double y =
+              grid.y[band.node[r] + n] * (1 - i / 8.0) + grid.y[band.node[r] + n + 1] * i / 8.0;
+          // Eight cells in a line lie 0.11 pixels beside a curve of 75 pixels radius, and curves
+          // tighten towards the epipoles.
+          ASSERT_LT(std::hypot(x - pixel->x(), y - pixel->y()), 0.25) << r << " " << n << " " << i;
+        }
+      }
+    }
+  }
+  EXPECT_GT(checked, 10000);
+  EXPECT_GT(seen, 6000);
+}
+
+TEST(SweepGeometry, AxisCoordinatesAreTheLawOfSines) {
+  const double b = 0.3, theta = 1.1, range = 2.3;
+  const Eigen::Vector2d point = range * Eigen::Vector2d(std::cos(theta), std::sin(theta));
+  const double displaced = std::atan2(point.y(), point.x() - b);
+  HypothesisLimits limits;
+  limits.baseline = b;
+  limits.min_range = range;
+  double least, most;
+  hypothesisRange(limits, theta, &least, &most);
+  EXPECT_DOUBLE_EQ(least, 0);
+  EXPECT_NEAR(theta + most, displaced, 1e-12);
+  limits.axis = Axis::kInverse;
+  hypothesisRange(limits, theta, &least, &most);
+  EXPECT_NEAR(most, 1 / point.y(), 1e-12);
+  EXPECT_NEAR(axisOf(Axis::kInverse, theta) + b * most, axisOf(Axis::kInverse, displaced), 1e-9);
+  EXPECT_NEAR(thetaOf(Axis::kInverse, axisOf(Axis::kInverse, theta)), theta, 1e-12);
+}
+
+TEST(SweepGeometry, NoBaselineIsRefused) {
+  EXPECT_THROW(makeEpipolarFrame(Eigen::Vector3d::Zero()), Error);
+}
+
+cv::Mat floodedSpeckles(cv::Mat h, float step, int least) {
+  cv::Mat seen(h.size(), CV_8UC1, cv::Scalar(0));
+  cv::Mat out = h.clone();
+  for (int y = 0; y < h.rows; ++y) {
+    for (int x = 0; x < h.cols; ++x) {
+      if (seen.at<uchar>(y, x) || std::isnan(h.at<float>(y, x))) continue;
+      std::vector<cv::Point> region;
+      std::deque<cv::Point> queue{{x, y}};
+      seen.at<uchar>(y, x) = 1;
+      while (!queue.empty()) {
+        const cv::Point p = queue.front();
+        queue.pop_front();
+        region.push_back(p);
+        for (const cv::Point d :
+             {cv::Point(1, 0), cv::Point(-1, 0), cv::Point(0, 1), cv::Point(0, -1)}) {
+          const cv::Point q = p + d;
+          if (q.x < 0 || q.y < 0 || q.x >= h.cols || q.y >= h.rows || seen.at<uchar>(q)) continue;
+          if (!(std::fabs(h.at<float>(p) - h.at<float>(q)) <= step)) continue;
+          seen.at<uchar>(q) = 1;
+          queue.push_back(q);
+        }
+      }
+      if (static_cast<int>(region.size()) < least)
+        for (const cv::Point& p : region) out.at<float>(p) = kNaN;
+    }
+  }
+  return out;
+}
+
+TEST(SweepFilters, SpecklesAreThoseOfAFlood) {
+  std::mt19937 random(5);
+  for (const cv::Size size :
+       {cv::Size(150, 130), cv::Size(1, 200), cv::Size(200, 1), cv::Size(64, 48)}) {
+    cv::Mat h(size, CV_32FC1);
+    for (int y = 0; y < size.height; ++y)
+      for (int x = 0; x < size.width; ++x)
+        h.at<float>(y, x) =
+            random() % 9 == 0 ? kNaN : static_cast<float>((random() % 5) * (random() % 3));
+    for (const int least : {2, 7, 40}) {
+      const cv::Mat expected = floodedSpeckles(h, 1.5f, least);
+      const auto lost = [](const cv::Mat& m) {
+        return std::count_if(m.begin<float>(), m.end<float>(),
+                             [](float v) { return std::isnan(v); });
+      };
+      for (const int threads : {1, 4}) {
+        cv::Mat filtered = h.clone();
+        const std::size_t removed = removeSpeckles(&filtered, 1.5f, least, threads);
+        EXPECT_EQ(static_cast<std::ptrdiff_t>(removed), lost(filtered) - lost(h));
+        for (int y = 0; y < size.height; ++y) {
+          for (int x = 0; x < size.width; ++x) {
+            ASSERT_EQ(std::isnan(expected.at<float>(y, x)), std::isnan(filtered.at<float>(y, x)))
+                << x << " " << y << " of " << size << ", least " << least;
+          }
+        }
+      }
+    }
+  }
+}
+
+class EverySet : public testing::TestWithParam<const char*> {
+ protected:
+  void SetUp() override { holdSimd(GetParam()); }
+  void TearDown() override { holdSimd("best"); }
+};
+
+TEST_P(EverySet, MedianIsThatOfNine) {
+  std::mt19937 random(7);
+  constexpr int kCount = 77;
+  std::vector<std::vector<float>> rows(3, std::vector<float>(kCount + 130));
+  for (auto& row : rows)
+    for (float& v : row) v = random() % 6 == 0 ? kNaN : static_cast<float>(random() % 1000);
+  const float* pointers[3] = {&rows[0][1], &rows[1][1], &rows[2][1]};
+  std::vector<float> out(kCount + 130);
+  medianRow(pointers, kCount, out.data());
+  int checked = 0;
+  for (int x = 0; x < kCount; ++x) {
+    const float middle = rows[1][x + 1];
+    if (std::isnan(middle)) {
+      EXPECT_TRUE(std::isnan(out[x]));
+      continue;
+    }
+    std::vector<float> nine;
+    for (int r = 0; r < 3; ++r)
+      for (int dx = 0; dx < 3; ++dx)
+        nine.push_back(std::isnan(rows[r][x + dx]) ? middle : rows[r][x + dx]);
+    std::nth_element(nine.begin(), nine.begin() + 4, nine.end());
+    EXPECT_EQ(out[x], nine[4]) << x;
+    ++checked;
+  }
+  EXPECT_GT(checked, 50);
+}
+
+TEST_P(EverySet, SamplesBetweenPixels) {
+  std::mt19937 random(9);
+  cv::Mat image(40, 50, CV_8UC1);
+  cv::randu(image, 0, 256);
+  PaddedImage padded;
+  padded.create(image.cols, image.rows);
+  for (int y = 0; y < image.rows; ++y)
+    std::copy(image.ptr(y), image.ptr(y) + image.cols, padded.row(y));
+  fillBorderRows(&padded);
+  constexpr int kRuns = 45;  // more than a batch
+  std::vector<float> x(kRuns + 1), y(kRuns + 1);
+  std::vector<std::uint8_t> mask(kRuns), grey(kRuns * 8 + 64, 77);
+  for (int n = 0; n <= kRuns; ++n) {
+    x[n] = 1 + static_cast<float>(random() % 4700) / 100;
+    y[n] = 1 + static_cast<float>(random() % 3700) / 100;
+    if (n < kRuns) mask[n] = n % 5 == 0 ? 0 : n % 7 == 0 ? 0x5A : 0xFF;
+  }
+  sampleRow(padded, x.data(), y.data(), mask.data(), kRuns, grey.data());
+  for (int n = 0; n < kRuns; ++n) {
+    for (int i = 0; i < 8; ++i) {
+      if (!(mask[n] >> i & 1)) {
+        EXPECT_EQ(grey[n * 8 + i], 0);
+        continue;
+      }
+      const double u = x[n] + (x[n + 1] - x[n]) * i / 8, v = y[n] + (y[n + 1] - y[n]) * i / 8;
+      const int p = static_cast<int>(u), q = static_cast<int>(v);
+      const auto at = [&](int dx, int dy) { return double(image.at<uchar>(q + dy, p + dx)); };
+      const double fu = u - p, fv = v - q;
+      const double truth = (at(0, 0) * (1 - fu) + at(1, 0) * fu) * (1 - fv) +
+                           (at(0, 1) * (1 - fu) + at(1, 1) * fu) * fv;
+      EXPECT_NEAR(grey[n * 8 + i], std::max(truth, 1.0), 3.0) << n << " " << i;
+    }
+  }
+  EXPECT_EQ(grey[kRuns * 8], 77) << "written past the end";
+}
+
+TEST_P(EverySet, MatchingFindsTheLeastBoxOfBits) {
+  std::mt19937 random(11);
+  constexpr int kWidth = 21, kHeight = 13, kCells = 4000;
+  std::vector<std::uint8_t> cells[kPlanes], reference[kPlanes];
+  for (auto& plane : cells) {
+    plane.resize(kCells + 64);
+    for (auto& byte : plane) byte = static_cast<std::uint8_t>(random());
+  }
+  constexpr int kStride = 32;
+  std::vector<std::int32_t> base(kStride * kHeight + 64);
+  for (auto& b : base) b = static_cast<std::int32_t>(random() % (kCells - 100)) + 20;
+  for (auto& plane : reference) {
+    plane.resize(base.size());
+    for (auto& byte : plane) byte = static_cast<std::uint8_t>(random());
+  }
+  constexpr int kInner = (kWidth - 2 * kRadius) * (kHeight - 2 * kRadius);
+  std::vector<std::uint16_t> cost(kInner), before(kInner), after(kInner);
+  std::vector<std::int16_t> index(kInner);
+  std::vector<std::uint8_t> scratch;
+  ChunkJob job;
+  job.width = kWidth;
+  job.height = kHeight;
+  job.stride = kStride;
+  job.base = base.data();
+  for (int p = 0; p < kPlanes; ++p) {
+    job.reference[p] = reference[p].data();
+    job.cells[p] = cells[p].data();
+  }
+  job.cost = cost.data();
+  job.index = index.data();
+  job.before = before.data();
+  job.after = after.data();
+  job.scratch = &scratch;
+  // Three chunks that join: hypotheses -8 to 5, 6 to 35 and 36 to 49.
+  const std::pair<int, int> chunks[] = {{-9, 16}, {5, 32}, {35, 16}};
+  job.fresh = true;
+  for (const auto& [first, lanes] : chunks) {
+    job.first = first;
+    job.lanes = lanes;
+    matchChunk(job);
+    job.fresh = false;
+  }
+  for (int y = 0; y < kHeight - 2 * kRadius; ++y) {
+    for (int x = 0; x < kWidth - 2 * kRadius; ++x) {
+      const auto box = [&](int k) {
+        int sum = 0;
+        for (int v = y; v < y + kWindow; ++v)
+          for (int u = x; u < x + kWindow; ++u)
+            for (int p = 0; p < kPlanes; ++p)
+              sum += __builtin_popcount(reference[p][v * kStride + u] ^
+                                        cells[p][base[v * kStride + u] + k]);
+        return sum;
+      };
+      int best = -8;
+      for (int k = -8; k <= 49; ++k)
+        if (box(k) < box(best)) best = k;
+      const int i = y * (kWidth - 2 * kRadius) + x;
+      ASSERT_EQ(index[i], best);
+      ASSERT_EQ(cost[i], box(best));
+      ASSERT_EQ(before[i], box(best - 1));
+      ASSERT_EQ(after[i], box(best + 1));
+    }
+  }
+}
+
+INSTANTIATE_TEST_SUITE_P(Sweep, EverySet, testing::Values("best", "avx2", "sse4", "scalar"));
+
+}  // namespace
+}  // namespace omnister::sweep
