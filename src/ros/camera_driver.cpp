@@ -102,6 +102,7 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
     static_frames_->add(toTransformStamped(opticalInLink(), now, link, parameters_.frame_id));
   }
   images_ = image_transport::ImageTransport(node_).advertiseCamera("image_raw", 4);
+  set_camera_info_ = node_.advertiseService("set_camera_info", &CameraDriver::setCameraInfo, this);
   lens_subscriber_ = node_.subscribe("lens_model", 1, &CameraDriver::onLens, this);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
@@ -373,6 +374,24 @@ void CameraDriver::onLens(const LensModelMessage::ConstPtr& message) {
   } catch (const std::exception& e) {
     ROS_WARN_STREAM_THROTTLE(10.0, "lens_model refused: " << printable(e.what(), 1000));
   }
+}
+
+bool CameraDriver::setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
+                                 sensor_msgs::SetCameraInfo::Response& response) {
+  try {
+    LensFile file = fromCameraInfo(request.camera_info, "set_camera_info");
+    file.camera_name = storeName();
+    const std::filesystem::path path = LensStore(parameters_.store).save(file.camera_name, file);
+    setLens(std::move(file));
+    response.success = true;
+    response.status_message = "saved as " + path.string();
+    ROS_INFO_STREAM("calibration " << response.status_message);
+  } catch (const std::exception& e) {
+    response.success = false;
+    response.status_message = e.what();
+    ROS_WARN_STREAM("set_camera_info refused: " << printable(e.what(), 1000));
+  }
+  return true;
 }
 
 void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {

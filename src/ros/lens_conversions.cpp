@@ -1,7 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <cmath>
 #include <limits>
+#include <set>
 
+#include "omnister/common/numbers.h"
+#include "omnister/lens/lens_import.h"
 #include "omnister/ros/conversions.h"
 
 namespace omnister {
@@ -22,6 +25,48 @@ sensor_msgs::CameraInfo toCameraInfo(const LensFile& file) {
     info.R[static_cast<std::size_t>(row * 4)] = 1.0;
   }
   return info;
+}
+
+LensFile fromCameraInfo(const sensor_msgs::CameraInfo& info, const std::string& source) {
+  // The importers know how to check these numbers, once they stand in the file that they read.
+  const std::set<std::string> known = {"plumb_bob", "rational_polynomial", "equidistant"};
+  if (known.count(info.distortion_model) == 0) {
+    throw InputError(source, "distortion_model",
+                     "is \"" + printable(info.distortion_model) +
+                         "\", expected plumb_bob, rational_polynomial or equidistant");
+  }
+  constexpr std::size_t kMostCoefficients = 14;
+  if (info.D.size() > kMostCoefficients) {
+    throw InputError(source, "D",
+                     "has " + std::to_string(info.D.size()) + " coefficients, expected at most " +
+                         std::to_string(kMostCoefficients));
+  }
+  const auto matrix = [](int rows, std::size_t cols, const auto& data) {
+    std::string text;
+    for (const double x : data) text += (text.empty() ? "" : ", ") + formatNumber(x);
+    return "{rows: " + std::to_string(rows) + ", cols: " + std::to_string(cols) + ", data: [" +
+           text + "]}\n";
+  };
+  const std::string text = "image_width: " + std::to_string(info.width) +
+                           "\nimage_height: " + std::to_string(info.height) +
+                           "\ncamera_name: camera\ncamera_matrix: " + matrix(3, 3, info.K) +
+                           "distortion_model: " + info.distortion_model +
+                           "\ndistortion_coefficients: " + matrix(1, info.D.size(), info.D);
+  const ForeignCamera camera = readForeignCamera(text, source, "camera_info");
+  const ForeignFit fit = fitForeignCamera(camera, "spline");
+  constexpr double kMaxResidual = 0.5;  // [px]
+  if (!(fit.fit.rms_px <= kMaxResidual)) {
+    throw InputError(source, "",
+                     "a lens surface misses it by " + formatNumber(fit.fit.rms_px) +
+                         " px RMS, more than " + formatNumber(kMaxResidual) + " px");
+  }
+  LensFile file;
+  file.image_size = camera.image_size;
+  file.lens = fit.fit.lens;
+  file.calibration.notes["imported_from"] = camera.format + " " + camera.model;
+  file.calibration.notes["import_residual_rms_px"] = formatNumber(fit.fit.rms_px);
+  file.calibration.notes["import_residual_max_px"] = formatNumber(fit.fit.max_px);
+  return file;
 }
 
 LensModelMessage toLensModelMessage(const LensFile& file, const std_msgs::Header& header) {

@@ -254,6 +254,66 @@ TEST_F(CameraTest, ABrokenLensParameterIsAnError) {
   EXPECT_THROW(openFake(), Error);
 }
 
+TEST_F(CameraTest, KeepsACalibrationThatItIsGiven) {
+  openFake();
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
+  sensor_msgs::SetCameraInfo call;
+  sensor_msgs::CameraInfo& info = call.request.camera_info;
+  info.width = 8;
+  info.height = 6;
+  info.distortion_model = "equidistant";
+  info.D = {0.01, 0.0, 0.0, 0.0};
+  info.K = {4.0, 0, 3.5, 0, 4.0, 2.5, 0, 0, 1};
+  ASSERT_TRUE(ros::service::call(node_.resolveName("set_camera_info"), call));
+  ASSERT_TRUE(call.response.success) << call.response.status_message;
+  ASSERT_TRUE(eventually([&] { return infos.last()->K[0] != 0.0; }));
+  EXPECT_NEAR(infos.last()->K[0], 4.0, 0.05);
+  const std::optional<LensFile> stored = LensStore(parameters_.store).load("F-1");
+  ASSERT_TRUE(stored);
+  EXPECT_EQ(stored->image_size, cv::Size(8, 6));
+
+  // Another start finds it.
+  driver_.reset();
+  openFake();
+  Collector<LensModelMessage> models(node_, "lens_model");
+  EXPECT_TRUE(eventually([&] { return models.size() == 1; }));
+
+  // Nonsense changes nothing.
+  for (const double f : {0.0, -1.0, std::nan(""), 1e300}) {
+    info.K[0] = f;
+    ASSERT_TRUE(ros::service::call(node_.resolveName("set_camera_info"), call));
+    EXPECT_FALSE(call.response.success) << f;
+    EXPECT_NE(call.response.status_message, "");
+  }
+  EXPECT_EQ(models.size(), 1u);
+}
+
+TEST_F(CameraTest, TakesOverALensThatACalibrationPublishes) {
+  openFake();
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
+  EXPECT_EQ(infos.last()->K[0], 0.0);
+  ros::Publisher calibration = node_.advertise<LensModelMessage>("lens_model", 1, true);
+  std_msgs::Header header;
+  header.frame_id = "another_optical";
+  calibration.publish(toLensModelMessage(lens(), header));
+  header.frame_id = parameters_.frame_id;
+  LensModelMessage broken = toLensModelMessage(lens(), header);
+  broken.yaml = "nonsense";
+  calibration.publish(broken);
+  const std::size_t had = infos.size();
+  ASSERT_TRUE(eventually([&] { return infos.size() > had + 5; }));
+  EXPECT_EQ(infos.last()->K[0], 0.0);
+  calibration.publish(toLensModelMessage(lens(), header));
+  ASSERT_TRUE(eventually([&] { return infos.last()->K[0] != 0.0; }));
+  // It says so itself from now on.
+  calibration.shutdown();
+  Collector<LensModelMessage> models(node_, "lens_model");
+  ASSERT_TRUE(eventually([&] { return models.size() == 1; }));
+  EXPECT_EQ(models.last()->model, "conic");
+}
+
 TEST_F(CameraTest, ACorruptStoreStartsUncalibrated) {
   std::filesystem::create_directories(parameters_.store);
   std::ofstream(LensStore(parameters_.store).pathOf("F-1")) << "lens_surface: {";

@@ -5,12 +5,14 @@
 /// latched `lens_model`, `/diagnostics`, and the static frames of its mount. A lens that another
 /// node publishes on `lens_model` for our frame is taken over. The device is opened at once,
 /// streams only while someone listens, and is opened again when it was lost. A recording that knows
-/// stage positions also publishes `stage_state` and the stage's tf.
+/// stage positions also publishes `stage_state` and the stage's tf. What
+/// `set_camera_info` is given is kept in the store, as a lens surface.
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
 #include <image_transport/camera_publisher.h>
 #include <ros/node_handle.h>
+#include <sensor_msgs/SetCameraInfo.h>
 #include <tf2_ros/transform_broadcaster.h>
 
 #include <atomic>
@@ -91,6 +93,8 @@ class CameraDriver {
   void setLens(LensFile file);
   /// Takes over a lens that a calibration publishes beside us.
   void onLens(const LensModelMessage::ConstPtr& message);
+  bool setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
+                     sensor_msgs::SetCameraInfo::Response& response);
   std::string storeName() const;
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
@@ -126,6 +130,7 @@ class CameraDriver {
   ros::Publisher lens_publisher_;
   ros::Publisher stage_publisher_;
   ros::Subscriber lens_subscriber_;
+  ros::ServiceServer set_camera_info_;
   diagnostic_updater::Updater diagnostics_;
   std::atomic<bool> stop_{false};
   std::thread thread_;

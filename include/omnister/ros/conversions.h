@@ -60,6 +60,11 @@ sensor_msgs::CameraInfo uncalibratedCameraInfo(int width, int height);
 /// The nearest standard model where there is one, else uncalibrated. Takes some milliseconds.
 sensor_msgs::CameraInfo toCameraInfo(const LensFile& file);
 
+/// A lens surface fitted to a calibration of the standard models.
+/// @throws InputError for numbers that make no camera, a model that is not standard, or a fit worse
+/// than 0.5 px RMS
+LensFile fromCameraInfo(const sensor_msgs::CameraInfo& info, const std::string& source);
+
 /// @param header stamp: when the lens was loaded or fitted; frame_id: optical frame
 LensModelMessage toLensModelMessage(const LensFile& file, const std_msgs::Header& header);
 
