@@ -386,7 +386,8 @@ Selection selectStructure(const FitInput& input, const Fit& first,
 }
 
 Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const BundleOptions& options,
-                               const BundleState& state, double loss_px, int camera) {
+                               const BundleState& state, double loss_px, int camera,
+                               double least_sigma_px) {
   const Eigen::MatrixXd information = reducedInformation(views, options, state);
   // Parameters differ by many orders of magnitude: bring the diagonal to one, and let a direction
   // that nothing determines have a variance that is huge but finite.
@@ -424,7 +425,8 @@ Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const Bundl
       6.0 * static_cast<double>(std::count(used_pose.begin(), used_pose.end(), true));
   const double freedom = std::max(1.0, 2.0 * count - unknowns) / (2.0 * count);
   const double slope = std::max(psi_slope / count, 0.05);
-  const double variance = psi_squared / count / freedom / (slope * slope);
+  const double variance =
+      std::max(psi_squared / count / freedom / (slope * slope), least_sigma_px * least_sigma_px);
 
   Eigen::Index first = 0;
   for (int i = 0; i < camera; ++i)
@@ -438,9 +440,12 @@ void refuseUndetermined(const FitInput& input, const BundleState& state, const L
   const ProjectionField field = projectionUncertainty(lens, covariance, image_size, 24);
   const double diagonal = std::hypot(image_size.width, image_size.height);
   const double limit = 4e-3 * diagonal;
-  if (field.rms_px <= limit) return;
   double largest = 0.0;
   for (const Pose& pose : state.poses) largest = std::max(largest, tilt(pose));
+  // Boards all square to the axis fix nothing but ratios (Johnson 1997, sec. 4.3, took them for
+  // metric); whatever else then settles the scale is the model's prejudice.
+  const bool all_square = degrees(largest) < 3.0;
+  if (field.rms_px <= limit && !all_square) return;
   double low_x = HUGE_VAL;
   double high_x = -HUGE_VAL;
   double low_y = HUGE_VAL;
@@ -457,7 +462,7 @@ void refuseUndetermined(const FitInput& input, const BundleState& state, const L
       (high_x - low_x) * (high_y - low_y) / (1.0 * image_size.width * image_size.height);
   const std::string verdict = "the views do not determine the lens (projection uncertain by " +
                               fixed(field.rms_px, 1) + " px): ";
-  if (degrees(largest) < 10.0) {
+  if (all_square || degrees(largest) < 10.0) {
     throw Error(
         verdict + "every board is square to the optical axis (largest tilt " +
         fixed(degrees(largest), 1) +
@@ -632,12 +637,15 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
   BundleOptions free;
   free.warp = options.board_warp;
   refuseUndetermined(input, first.state, *first.state.lenses[0],
-                     lensCovariance(views, free, first.state, first.loss_px, 0), input.image_size);
+                     lensCovariance(views, free, first.state, first.loss_px, 0, kDoubtSigmaPx),
+                     input.image_size);
 
   const Selection selection = selectStructure(input, first, options);
   const Fit& fit = selection.fit;
   const Eigen::MatrixXd covariance = lensCovariance(views, free, fit.state, fit.loss_px, 0);
-  refuseUndetermined(input, fit.state, *fit.state.lenses[0], covariance, input.image_size);
+  refuseUndetermined(input, fit.state, *fit.state.lenses[0],
+                     lensCovariance(views, free, fit.state, fit.loss_px, 0, kDoubtSigmaPx),
+                     input.image_size);
 
   // The next richer model tells what the chosen one cannot say.
   LensStructure richer = fit.structure;

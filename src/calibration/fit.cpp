@@ -19,7 +19,10 @@ constexpr double kPi = 3.14159265358979323846;
 constexpr double kLossSigmas = 3.0;
 /// The loss never gets so narrow that rounding decides who is an outlier [px].
 constexpr double kLeastLossPx = 0.01;
-/// Room beyond the outermost corner, so that corners do not stand on the very edge of the field.
+/// Room beyond the outermost corner during the fit. Little, since the surface is held one-to-one
+/// over all of the field, which the best surface need not be far beyond the corners.
+constexpr double kFitMargin = 1.005;
+/// Room beyond the outermost corner in the end, where the surface stays one-to-one so far.
 constexpr double kFieldMargin = 1.05;
 constexpr double kLargestField = kPi - 0.02;
 
@@ -33,8 +36,8 @@ double medianOf(std::vector<double> values) {
 double lossFor(double sigma_px) { return std::max(kLossSigmas * sigma_px, kLeastLossPx); }
 
 /// Field to fit over, given the outermost corner.
-double fieldFor(double outermost, const std::string& model) {
-  const double field = std::min(kFieldMargin * outermost, kLargestField);
+double fieldFor(double outermost, const std::string& model, double margin = kFitMargin) {
+  const double field = std::min(margin * outermost, kLargestField);
   // A sphere seen from above ends at 90 degrees.
   return model == "spherical" ? std::min(field, 0.5 * kPi - 2e-3) : field;
 }
@@ -53,15 +56,24 @@ std::vector<Eigen::Vector3d> directions(double max_theta) {
   return result;
 }
 
-/// Adjusts twice, the second time with the loss that the first showed to fit.
+/// Adjusts until loss and field are those that the corners ask for.
 bool settle(const FitInput& input, const std::vector<BundleView>& views, BundleOptions options,
             Fit& fit) {
-  for (int round = 0; round < 2; ++round) {
+  constexpr int kRounds = 4;
+  for (int round = 0; round < kRounds; ++round) {
     options.loss_px = lossFor(fit.sigma_px);
     options.tolerance = round == 0 ? 1e-5 : 1e-10;
     if (!adjust(views, options, fit.state)) return false;
     fit.loss_px = options.loss_px;
     fit.sigma_px = statisticsOf(residualsOf(input, fit.state)).sigma_px;
+    // A corner outside the field is only roughly predicted: move the edge behind the last one.
+    const double field =
+        fieldFor(outermostAngle(input, fit.state, fit.sigma_px), fit.structure.model);
+    LensPtr& lens = fit.state.lenses[0];
+    const double before = lens->maxTheta();
+    if (field > 0.0) lens = withField(lens, field);
+    const bool steady = lens->maxTheta() <= before + 1e-4;
+    if (round > 0 && steady && lossFor(fit.sigma_px) > 0.8 * fit.loss_px) break;
   }
   return std::isfinite(fit.sigma_px);
 }
@@ -279,7 +291,8 @@ std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStruc
   for (const BundleView& view : views) refinePose({view}, 0.0, fit.state, 3);
   fit.sigma_px = std::max(from.sigma_px, statisticsOf(residualsOf(input, fit.state)).sigma_px);
   if (!settle(input, views, options, fit)) return std::nullopt;
-  const double reached = fieldFor(outermostAngle(input, fit.state, fit.sigma_px), structure.model);
+  const double reached =
+      fieldFor(outermostAngle(input, fit.state, fit.sigma_px), structure.model, kFieldMargin);
   if (reached > 0.0) fit.state.lenses[0] = withField(fit.state.lenses[0], reached);
   return fit;
 }

@@ -36,9 +36,15 @@ Selection selectStructure(const FitInput& input, const Fit& first,
                           const CalibrationOptions& options);
 
 /// Covariance of the lens parameters of camera `camera` with everything else marginalised; its
-/// noise is that of the residuals under the loss of the fit (Huber 1981, sec. 7.6).
+/// noise is that of the residuals under the loss of the fit (Huber 1981, sec. 7.6), but at least
+/// `least_sigma_px`.
 Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const BundleOptions& options,
-                               const BundleState& state, double loss_px, int camera);
+                               const BundleState& state, double loss_px, int camera,
+                               double least_sigma_px = 0.0);
+
+/// Noise that the question "is the lens determined at all?" assumes, however well the corners fit
+/// [px].
+inline constexpr double kDoubtSigmaPx = 0.05;
 
 /// Lens file, view results, warnings and refusals of a finished fit.
 /// @param richer a fit of a richer structure to compare with, if there is one
