@@ -135,8 +135,8 @@ TEST(Calibrate, NoiseIsCarriedIntoTheCovariance) {
     EXPECT_LT(error.rms, 0.2) << "seed " << seed;
     const ProjectionField surface =
         projectionDifference(*truth, *result.file.lens, wideScene(0, 0).image_size);
-    EXPECT_LT(surface.rms_px, 0.09) << "seed " << seed;
-    EXPECT_LT(surface.max_px, 0.2) << "seed " << seed;
+    EXPECT_LT(surface.rms_px, 0.18) << "seed " << seed;
+    EXPECT_LT(surface.max_px, 0.25) << "seed " << seed;
     squares += surface.rms_px * surface.rms_px;
     ASSERT_TRUE(result.file.covariance);
     const Eigen::VectorXd difference = result.file.lens->parameters() - truth->parameters();
@@ -149,7 +149,7 @@ TEST(Calibrate, NoiseIsCarriedIntoTheCovariance) {
   const double z_deviation = std::sqrt(square_sum / count);
   EXPECT_GT(z_deviation, 0.75);
   EXPECT_LT(z_deviation, 1.3);
-  EXPECT_LT(std::sqrt(squares / seeds), 0.06);
+  EXPECT_LT(std::sqrt(squares / seeds), 0.07);
 }
 
 TEST(Calibrate, OutliersHardlyMatter) {
