@@ -70,7 +70,7 @@ std::string currentDate() {
   return text;
 }
 
-Prepared prepareViews(const Detections& detections, bool warp) {
+Prepared prepareViews(const Detections& detections, bool warp, const Board* board) {
   if (detections.image_size.width <= 0 || detections.image_size.height <= 0) {
     throw Error("calibration needs the size of the images");
   }
@@ -89,7 +89,7 @@ Prepared prepareViews(const Detections& detections, bool warp) {
   }
   prepared.input.image_size = detections.image_size;
   prepared.input.warp = warp;
-  prepared.input.board = makeBoard(detections.views);
+  prepared.input.board = board != nullptr ? *board : makeBoard(detections.views);
   const auto leaveOut = [&](ViewResult& result, const std::string& reason) {
     result.used = false;
     result.reason = reason;

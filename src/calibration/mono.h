@@ -18,8 +18,9 @@ struct Prepared {
   std::vector<std::string> warnings;
 };
 
-/// Leaves out views that cannot be used, by name. @throws Error when fewer than 3 are left
-Prepared prepareViews(const Detections& detections, bool warp);
+/// Leaves out views that cannot be used, by name.
+/// @param board its plane; null: that of these detections @throws Error when fewer than 3 are left
+Prepared prepareViews(const Detections& detections, bool warp, const Board* board = nullptr);
 
 /// A conic fit, with views that contradict it left out of `prepared` by name.
 /// @throws Error when nothing explains the corners

@@ -21,6 +21,7 @@ namespace omnister::tools {
 void addCalibrate(CLI::App& app);
 void addCalibrateScan(CLI::App& app);
 void addImport(CLI::App& app);
+void addCalibrateStereo(CLI::App& app);
 void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
 void addStereo(CLI::App& app);
@@ -35,6 +36,7 @@ constexpr AddCommand kCommands[] = {
     addCalibrate,
     addCalibrateScan,
     addImport,
+    addCalibrateStereo,
     addProject,
     addUnproject,
     addStereo,
