@@ -8,12 +8,12 @@
 #include <random>
 #include <string>
 
+#include "board_pose.h"
 #include "bundle.h"
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
 #include "omnister/lens/lens_fit.h"
 #include "scan_adjustment.h"
-#include "start.h"
 
 namespace omnister {
 namespace {
@@ -293,27 +293,6 @@ Eigen::Matrix3d nearestRotation(const Eigen::Matrix3d& M) {
   return R;
 }
 
-/// Pose of a board with the lens as it is; nothing where its corners have no rays or lie on a line.
-std::optional<Pose> boardPose(const ViewDetections& view, const LensPtr& lens) {
-  std::vector<Eigen::Vector3d> bearings;
-  std::vector<Corner> corners;
-  for (std::size_t i = 0; i < view.pixels.size(); ++i) {
-    const auto bearing = lens->unproject(view.pixels[i]);
-    if (!bearing) return std::nullopt;
-    bearings.push_back(*bearing);
-    corners.push_back({view.pixels[i], view.points[i], Eigen::Vector2d::Zero()});
-  }
-  const auto start = poseFromBearings(bearings, corners);
-  if (!start) return std::nullopt;
-  BundleState state;
-  state.lenses = {lens};
-  state.poses = {*start};
-  BundleView sight;
-  sight.corners = &corners;
-  refinePose({sight}, 5.0, state);
-  return state.poses[0];
-}
-
 /// The scale c for which the boards are seen best, each with a pose of its own.
 double scaleFromBoards(const Detections& boards, const ScanEstimate& estimate, int threads) {
   const int steps = 41;
@@ -324,7 +303,7 @@ double scaleFromBoards(const Detections& boards, const ScanEstimate& estimate, i
     if (!lens) return;
     double cost = 0.0;
     for (const ViewDetections& view : boards.views) {
-      const auto pose = boardPose(view, lens);
+      const auto pose = boardPose(view, *lens);
       if (!pose) return;
       for (std::size_t k = 0; k < view.pixels.size(); ++k) {
         const auto pixel = projectContinued(*lens, *pose * view.points[k]);
@@ -670,7 +649,7 @@ TargetFreeResult calibrateTargetFree(const FeatureTracks& tracks,
   if (!options.boards.views.empty()) {
     data.boards = &options.boards;
     for (const ViewDetections& view : options.boards.views) {
-      const auto pose = boardPose(view, estimate.lens);
+      const auto pose = boardPose(view, *estimate.lens);
       if (!pose) {
         throw InputError(view.name, "", "the board lies outside the field that the features cover");
       }
