@@ -93,8 +93,8 @@ ReferenceMap makeReferenceMap(const WideLens& lens, cv::Size full_size, int leve
       cv::Size((full_size.width + scale - 1) / scale, (full_size.height + scale - 1) / scale);
   map.axis = axis;
   const int width = map.size.width, height = map.size.height;
-  map.phi.assign(static_cast<std::size_t>(width) * height, kNoRay);
-  map.a.assign(static_cast<std::size_t>(width) * height, 0.0f);
+  map.phi.assign(static_cast<std::size_t>(width) * height + kMapSlack, kNoRay);
+  map.a.assign(static_cast<std::size_t>(width) * height + kMapSlack, 0.0f);
 
   const auto rayAt = [&](int x, int y) {
     return lens.lens->unproject(Eigen::Vector2d((x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5));

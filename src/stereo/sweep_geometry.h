@@ -46,6 +46,9 @@ inline constexpr std::uint16_t kNoRay = 0xFFFF;
 /// phi in the units of ReferenceMap::phi per radian; 0 stands for -pi.
 inline constexpr double kPhiUnits = 65534.0 / 6.283185307179586;
 
+/// Elements behind the last pixel of a map, for vectors that reach past it.
+inline constexpr int kMapSlack = 64;
+
 /// Epipolar coordinates of every pixel of a (possibly reduced) reference image.
 struct ReferenceMap {
   cv::Size size;

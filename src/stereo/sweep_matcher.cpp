@@ -127,9 +127,6 @@ class SweepMatcher : public Matcher {
       level.reference.create(r.width, r.height);
       level.displaced.create(d.width, d.height);
       level.h = makePlane(r, CV_32FC1);
-      // Vector code reads whole vectors.
-      level.map.phi.resize(level.map.phi.size() + 64, kNoRay);
-      level.map.a.resize(level.map.a.size() + 64, 0.0f);
     }
     prepareClaims();
   }
@@ -161,7 +158,8 @@ class SweepMatcher : public Matcher {
     value_ = makePlane(size, CV_32SC1);
     steep_ = makePlane(size, CV_16UC1);
     claim_ = makePlane(size, CV_32SC1);
-    smooth_ = makePlane(size, CV_32FC1);
+    // Claims are done with when smoothing begins.
+    smooth_ = cv::Mat(size, CV_32FC1, claim_.data, claim_.step);
     claim_rows_.assign(level.layout.tiles.size(), {1, 0});
     finest_step_ = std::numeric_limits<float>::max();
     for (const Band& band : level.grid.bands)

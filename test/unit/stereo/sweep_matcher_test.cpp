@@ -41,8 +41,8 @@ Pair makePair(const std::vector<test::Rectangle>& scene, const LensPtr& lens, cv
   pair.geometry.reference_lens = lens;
   pair.geometry.reference_size = size;
   pair.geometry.displaced.push_back({lens, size, T_ref_disp});
-  pair.reference = test::look(scene, *lens, size, Pose::Identity());
-  pair.displaced = test::look(scene, *lens, size, T_ref_disp).image;
+  pair.reference = test::look(scene, *lens, size, Pose::Identity(), 2);
+  pair.displaced = test::look(scene, *lens, size, T_ref_disp, 2).image;
   return pair;
 }
 
@@ -106,13 +106,13 @@ struct Setting {
 class EveryLensAndPose : public testing::TestWithParam<Setting> {};
 
 TEST_P(EveryLensAndPose, FindsTheWallsOfARoom) {
-  const cv::Size size(320, 280);
+  const cv::Size size(260, 230);
   const LensPtr lens = lensOf(GetParam().model, size, GetParam().field_deg);
   const Pair pair = makePair(test::room(1.6, 0.09), lens, size, GetParam().T_ref_disp);
   const MatchResult result =
       makeSweepMatcher(pair.geometry, {})->match(pair.reference.image, {pair.displaced});
   Quality quality = judge(pair, result);
-  ASSERT_GT(quality.truth, 20000u);
+  ASSERT_GT(quality.truth, 15000u);
   EXPECT_GT(quality.density(), 0.95);
   EXPECT_LT(quality.quantile(0.5), 0.12);
   EXPECT_LT(quality.quantile(0.95), 0.6);
@@ -148,10 +148,11 @@ INSTANTIATE_TEST_SUITE_P(
 
 class SmallPair : public testing::Test {
  protected:
-  SmallPair()
-      : size_(240, 200),
-        pair_(makePair(test::room(1.5, 0.1), lensOf("spline", size_, 190), size_,
-                       test::pose(0.14, 0.03, 0.02, 0.1, {0.2, 1, 0}))) {}
+  static const Pair& rendered() {
+    static const Pair pair = makePair(test::room(1.5, 0.1), lensOf("spline", {240, 200}, 190),
+                                      {240, 200}, test::pose(0.14, 0.03, 0.02, 0.1, {0.2, 1, 0}));
+    return pair;
+  }
   ~SmallPair() override { sweep::holdSimd("best"); }
 
   MatchResult match(const MatcherOptions& options = {}) const {
@@ -159,8 +160,8 @@ class SmallPair : public testing::Test {
         ->match(pair_.reference.image, {pair_.displaced});
   }
 
-  cv::Size size_;
-  Pair pair_;
+  const cv::Size size_{240, 200};
+  const Pair& pair_ = rendered();
 };
 
 TEST_F(SmallPair, IsTheSameOnEveryInstructionSet) {
@@ -189,17 +190,21 @@ TEST_F(SmallPair, IsTheSameForAnyNumberOfThreadsAndTime) {
   EXPECT_TRUE(same(one, matcher->match(pair_.reference.image, {pair_.displaced})));
 }
 
-TEST_F(SmallPair, AgreesWithTheThesisMatcher) {
+TEST(Sweep, AgreesWithTheThesisMatcher) {
+  const cv::Size size(120, 100);
+  const Pair pair = makePair(test::room(1.5, 0.16), lensOf("conic", size, 150), size,
+                             test::pose(0.14, 0.03, 0.02));
   MatcherOptions options;
-  options.min_range = 0.5;
-  const MatchResult sweep = match(options);
+  options.min_range = 0.8;
+  const MatchResult sweep =
+      makeSweepMatcher(pair.geometry, options)->match(pair.reference.image, {pair.displaced});
   const MatchResult thesis =
-      makeThesisMatcher(pair_.geometry, options)->match(pair_.reference.image, {pair_.displaced});
-  const Pose T_disp_ref = pair_.geometry.displaced[0].T_ref_disp.inverse();
-  const LensModel& lens = *pair_.geometry.reference_lens;
+      makeThesisMatcher(pair.geometry, options)->match(pair.reference.image, {pair.displaced});
+  const Pose T_disp_ref = pair.geometry.displaced[0].T_ref_disp.inverse();
+  const LensModel& lens = *pair.geometry.reference_lens;
   int both = 0, near = 0;
-  for (int y = 0; y < size_.height; ++y) {
-    for (int x = 0; x < size_.width; ++x) {
+  for (int y = 0; y < size.height; ++y) {
+    for (int x = 0; x < size.width; ++x) {
       const double a = sweep.range.at<float>(y, x), b = thesis.range.at<float>(y, x);
       if (std::isnan(a) || std::isnan(b)) continue;
       const Eigen::Vector3d ray = *lens.unproject(Eigen::Vector2d(x, y));
@@ -209,7 +214,7 @@ TEST_F(SmallPair, AgreesWithTheThesisMatcher) {
       near += (*p - *q).norm() < 1.0;
     }
   }
-  ASSERT_GT(both, 15000);
+  ASSERT_GT(both, 5000);
   EXPECT_GT(near, 0.95 * both);
 }
 
