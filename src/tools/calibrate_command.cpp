@@ -4,6 +4,7 @@
 #include <memory>
 
 #include "calibration_arguments.h"
+#include "calibration_report.h"
 #include "omnister/common/error.h"
 
 namespace omnister::tools {
@@ -35,6 +36,10 @@ void run(const Arguments& arguments) {
   if (!arguments.images.empty()) json["views"] = arguments.images.size();
   json["max_theta_rad"] = result.file.lens->maxTheta();
   json["warnings"] = result.warnings;
+  if (!arguments.common.report_folder.empty()) {
+    const std::string html = calibrationReport("Lens calibration", detections, result);
+    writeReport(arguments.common.report_folder, "report.html", html);
+  }
   if (!arguments.out.empty()) writeLensFile(arguments.out, result.file);
   json["seconds"] = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
   printResult(*arguments.json, json);

@@ -7,6 +7,7 @@
 #include <memory>
 
 #include "calibration_arguments.h"
+#include "calibration_report.h"
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
 
@@ -87,6 +88,13 @@ void run(const Arguments& arguments) {
     };
     if (out_left.empty()) out_left = beside("left");
     if (out_right.empty()) out_right = beside("right");
+  }
+  if (!arguments.common.report_folder.empty()) {
+    const std::string& folder = arguments.common.report_folder;
+    const std::string html_left = calibrationReport("Left camera", left, result.left);
+    const std::string html_right = calibrationReport("Right camera", right, result.right);
+    writeReport(folder, "report_left.html", html_left);
+    writeReport(folder, "report_right.html", html_right);
   }
   if (!out_left.empty()) writeLensFile(out_left, result.left.file);
   if (!out_right.empty()) writeLensFile(out_right, result.right.file);

@@ -2,9 +2,11 @@
 #include "calibration_arguments.h"
 
 #include <algorithm>
+#include <filesystem>
 
 #include "omnister/calibration/detector.h"
 #include "omnister/common/error.h"
+#include "omnister/common/file_io.h"
 #include "omnister/common/image_file.h"
 
 namespace omnister::tools {
@@ -29,6 +31,8 @@ void addCalibrationArguments(CLI::App& command, CalibrationArguments& arguments)
                            : std::string();
       })
       ->check(CLI::Range(0, 10000));
+  command.add_option("--report", arguments.report_folder,
+                     "Folder for an HTML report with residuals, coverage and uncertainty");
   command.add_option("--threads", arguments.threads, "Threads to use (0: every core)")
       ->check(CLI::Range(0, 1024));
   command.add_flag("--flat-board", arguments.flat_board,
@@ -93,6 +97,13 @@ Detections gatherDetections(const CalibrationArguments& arguments,
   if (next != detections.views.size())
     throw Error("the detected views are not those of the images");
   return all;
+}
+
+void writeReport(const std::string& folder, const std::string& name, const std::string& html) {
+  std::error_code error;
+  std::filesystem::create_directories(folder, error);
+  if (error) throw IoError("create", folder, error.value());
+  writeFileAtomically(std::filesystem::path(folder) / name, html);
 }
 
 void addFigures(nlohmann::ordered_json& json,

@@ -32,6 +32,9 @@ Detections gatherDetections(const CalibrationArguments& arguments,
                             const std::vector<std::string>& images,
                             const std::string& detections_file, bool keep_missed);
 
+/// Writes one file of a report, making the folder where it is missing. @throws IoError
+void writeReport(const std::string& folder, const std::string& name, const std::string& html);
+
 /// Sums of both kinds of calibration under the contract's keys.
 void addFigures(nlohmann::ordered_json& json, const std::vector<const CalibrationResult*>& cameras);
 

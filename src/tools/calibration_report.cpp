@@ -1,0 +1,349 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "calibration_report.h"
+
+#include <cairo-svg.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdio>
+#include <functional>
+#include <memory>
+
+#include "omnister/calibration/uncertainty.h"
+#include "omnister/common/error.h"
+
+namespace omnister::tools {
+namespace {
+
+constexpr double kPi = 3.14159265358979323846;
+constexpr int kSectors = 12;
+constexpr int kRings = 6;
+
+std::string fixed(double value, int digits) {
+  if (!std::isfinite(value)) return "-";
+  char text[64];
+  std::snprintf(text, sizeof text, "%.*f", digits, value);
+  return text;
+}
+
+std::string escaped(const std::string& text) {
+  std::string safe;
+  for (const char c : printable(text, 1000)) {
+    switch (c) {
+      case '<':
+        safe += "&lt;";
+        break;
+      case '>':
+        safe += "&gt;";
+        break;
+      case '&':
+        safe += "&amp;";
+        break;
+      case '"':
+        safe += "&quot;";
+        break;
+      default:
+        safe += c;
+    }
+  }
+  return safe;
+}
+
+/// A drawing of one plot: data coordinates inside a frame with a few numbers along its axes.
+class Plot {
+ public:
+  Plot(double width, double height, double x0, double x1, double y0, double y1)
+      : width_(width), height_(height), x0_(x0), x1_(x1), y0_(y0), y1_(y1) {
+    surface_.reset(cairo_svg_surface_create_for_stream(&Plot::append, &svg_, width, height));
+    cairo_.reset(cairo_create(surface_.get()));
+    cairo_select_font_face(cairo_.get(), "sans-serif", CAIRO_FONT_SLANT_NORMAL,
+                           CAIRO_FONT_WEIGHT_NORMAL);
+    cairo_set_font_size(cairo_.get(), 11);
+  }
+
+  double x(double value) const {
+    return kLeft + (value - x0_) / (x1_ - x0_) * (width_ - kLeft - kMargin);
+  }
+  double y(double value) const {
+    return height_ - kBottom - (value - y0_) / (y1_ - y0_) * (height_ - kBottom - kMargin);
+  }
+
+  void color(double red, double green, double blue) {
+    cairo_set_source_rgb(cairo_.get(), red, green, blue);
+  }
+  void dot(double px, double py, double radius = 1.3) {
+    cairo_arc(cairo_.get(), x(px), y(py), radius, 0, 2 * kPi);
+    cairo_fill(cairo_.get());
+  }
+  void line(double ax, double ay, double bx, double by) {
+    cairo_set_line_width(cairo_.get(), 1.0);
+    cairo_move_to(cairo_.get(), x(ax), y(ay));
+    cairo_line_to(cairo_.get(), x(bx), y(by));
+    cairo_stroke(cairo_.get());
+  }
+  void box(double ax, double ay, double bx, double by) {
+    cairo_rectangle(cairo_.get(), std::min(x(ax), x(bx)), std::min(y(ay), y(by)),
+                    std::abs(x(bx) - x(ax)), std::abs(y(by) - y(ay)));
+    cairo_fill(cairo_.get());
+  }
+  void text(double px, double py, const std::string& words) {
+    cairo_move_to(cairo_.get(), px, py);
+    cairo_show_text(cairo_.get(), words.c_str());
+  }
+
+  /// Frame, numbers and names of the axes; closes the drawing. @return the SVG element
+  std::string finish(const std::string& x_name, const std::string& y_name, int digits = 0) {
+    color(0, 0, 0);
+    cairo_set_line_width(cairo_.get(), 1.0);
+    cairo_rectangle(cairo_.get(), kLeft, kMargin, width_ - kLeft - kMargin,
+                    height_ - kBottom - kMargin);
+    cairo_stroke(cairo_.get());
+    for (int i = 0; i <= 4; ++i) {
+      const double vx = x0_ + (x1_ - x0_) * i / 4.0;
+      const double vy = y0_ + (y1_ - y0_) * i / 4.0;
+      text(x(vx) - 10, height_ - kBottom + 14, fixed(vx, std::abs(x1_ - x0_) < 5 ? 2 : 0));
+      text(2, y(vy) + 4, fixed(vy, std::abs(y1_ - y0_) < 5 ? std::max(digits, 2) : digits));
+    }
+    text(0.5 * width_ - 40, height_ - 4, x_name);
+    text(2, 10, y_name);
+    cairo_.reset();
+    cairo_surface_finish(surface_.get());
+    return svg_;
+  }
+
+ private:
+  static constexpr double kLeft = 48;
+  static constexpr double kBottom = 34;
+  static constexpr double kMargin = 14;
+
+  static cairo_status_t append(void* text, const unsigned char* bytes, unsigned int length) {
+    static_cast<std::string*>(text)->append(reinterpret_cast<const char*>(bytes), length);
+    return CAIRO_STATUS_SUCCESS;
+  }
+
+  struct Release {
+    void operator()(cairo_surface_t* surface) const { cairo_surface_destroy(surface); }
+    void operator()(cairo_t* cairo) const { cairo_destroy(cairo); }
+  };
+  double width_, height_, x0_, x1_, y0_, y1_;
+  std::string svg_;
+  std::unique_ptr<cairo_surface_t, Release> surface_;
+  std::unique_ptr<cairo_t, Release> cairo_;
+};
+
+struct Point {
+  Eigen::Vector2d pixel, residual;
+};
+
+/// As an image of its own: drawings inside one page would share the names of their glyphs.
+std::string asImage(const std::string& svg) {
+  static constexpr char kDigits[] =
+      "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+  std::string text = "<img alt=\"\" src=\"data:image/svg+xml;base64,";
+  text.reserve(svg.size() * 4 / 3 + 64);
+  for (std::size_t i = 0; i < svg.size(); i += 3) {
+    unsigned bits = 0;
+    for (std::size_t k = 0; k < 3; ++k) {
+      bits = bits << 8 | (i + k < svg.size() ? static_cast<unsigned char>(svg[i + k]) : 0u);
+    }
+    for (std::size_t k = 0; k < 4; ++k) {
+      text += i + k <= svg.size() ? kDigits[bits >> (18 - 6 * k) & 63u] : '=';
+    }
+  }
+  return text + "\">";
+}
+
+std::string structureText(const LensStructure& structure) {
+  std::string text = structure.model;
+  if (structure.model == "asphere" && structure.even_terms > 0) {
+    text += " r^" + std::to_string(2 + 2 * structure.even_terms);
+  }
+  if (structure.model == "spline") text += ", " + std::to_string(structure.knots) + " knots";
+  if (structure.affinity) text += " + affinity";
+  if (structure.decentring) text += " + decentring";
+  return text;
+}
+
+std::string row(const std::vector<std::string>& cells, const char* tag = "td") {
+  std::string text = "<tr>";
+  for (const std::string& cell : cells) {
+    text += std::string("<") + tag + ">" + cell + "</" + tag + ">";
+  }
+  return text + "</tr>\n";
+}
+
+}  // namespace
+
+std::string calibrationReport(const std::string& title, const Detections& detections,
+                              const CalibrationResult& result) {
+  const LensModel& lens = *result.file.lens;
+  const cv::Size size = result.file.image_size;
+  const Eigen::Vector2d center = lens.center();
+  std::vector<Point> points;
+  double largest = 0.0;
+  double radius = 1.0;
+  for (std::size_t v = 0; v < result.views.size() && v < detections.views.size(); ++v) {
+    if (!result.views[v].used) continue;
+    const auto& pixels = detections.views[v].pixels;
+    for (std::size_t i = 0; i < pixels.size() && i < result.views[v].residuals.size(); ++i) {
+      points.push_back({pixels[i], result.views[v].residuals[i]});
+      radius = std::max(radius, (pixels[i] - center).norm());
+      largest = std::max(largest, points.back().residual.norm());
+    }
+  }
+  std::vector<double> lengths;
+  for (const Point& point : points) lengths.push_back(point.residual.norm());
+  std::sort(lengths.begin(), lengths.end());
+  // The plots show all but the last hundredth; what lies beyond stands on their upper edge.
+  const double top =
+      lengths.empty() ? 1.0 : std::max(1e-6, 1.3 * lengths[lengths.size() * 99 / 100]);
+
+  std::string html =
+      "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>" + escaped(title) +
+      "</title>\n<style>body{font-family:sans-serif;max-width:1100px;margin:1em auto}"
+      "table{border-collapse:collapse}td,th{border:1px solid #bbb;padding:2px 8px;"
+      "text-align:left}figure{display:inline-block;margin:8px}tr.chosen{background:#dfd}"
+      "</style></head><body>\n<h1>" +
+      escaped(title) + "</h1>\n<table>\n";
+  html += row({"lens", escaped(result.file.calibration.notes.count("structure")
+                                   ? result.file.calibration.notes.at("structure")
+                                   : std::string(lens.model()))});
+  html += row({"RMS over all corners", fixed(result.rms_px, 4) + " px"});
+  html += row({"RMS over unseen views",
+               result.holdout_rms_px ? fixed(*result.holdout_rms_px, 4) + " px" : "not computed"});
+  html += row({"corners", std::to_string(result.points)});
+  html += row({"half field of view", fixed(lens.maxTheta() * 180 / kPi, 1) + " degrees"});
+  html += row({"board warp", fixed(result.board_warp[0], 6) + ", " +
+                                 fixed(result.board_warp[1], 6) + " board units"});
+  const auto names = lens.parameterNames();
+  const Eigen::VectorXd values = lens.parameters();
+  for (std::size_t i = 0; i < names.size(); ++i) {
+    const auto k = static_cast<Eigen::Index>(i);
+    std::string value = fixed(values[k], 6);
+    if (result.file.covariance)
+      value += " &plusmn; " + fixed(std::sqrt((*result.file.covariance)(k, k)), 6);
+    html += row({escaped(names[i]), value});
+  }
+  html += "</table>\n";
+  if (!result.warnings.empty()) {
+    html += "<h2>Warnings</h2><ul>\n";
+    for (const std::string& warning : result.warnings)
+      html += "<li>" + escaped(warning) + "</li>\n";
+    html += "</ul>\n";
+  }
+
+  const auto figure = [&](const std::string& svg, const std::string& caption) {
+    html += "<figure>" + asImage(svg) + "<figcaption>" + caption + "</figcaption></figure>\n";
+  };
+  html += "<h2>Residuals</h2>\n";
+  const double height = 480.0 * size.height / size.width + 20.0;
+  {
+    Plot plot(520, height, 0, size.width, size.height, 0);
+    const double gain = 0.03 * size.width / top;
+    plot.color(0.1, 0.3, 0.8);
+    for (const Point& point : points) {
+      const Eigen::Vector2d tip = point.pixel + gain * point.residual;
+      plot.line(point.pixel.x(), point.pixel.y(), tip.x(), tip.y());
+    }
+    figure(plot.finish("u [px]", "v [px]"),
+           "Residual vectors, " + fixed(gain, 0) + " times their size");
+  }
+  {
+    Plot plot(520, 300, 0, radius, 0, top);
+    plot.color(0.1, 0.3, 0.8);
+    for (const Point& point : points) {
+      plot.dot((point.pixel - center).norm(), std::min(top, point.residual.norm()));
+    }
+    figure(plot.finish("radius [px]", "residual [px]", 2), "Residual against radius");
+  }
+  {
+    Plot plot(520, 300, -180, 180, 0, top);
+    plot.color(0.1, 0.3, 0.8);
+    for (const Point& point : points) {
+      const Eigen::Vector2d offset = point.pixel - center;
+      plot.dot(std::atan2(offset.y(), offset.x()) * 180 / kPi,
+               std::min(top, point.residual.norm()));
+    }
+    figure(plot.finish("azimuth [degrees]", "residual [px]", 2), "Residual against azimuth");
+  }
+
+  html += "<h2>Coverage and uncertainty</h2>\n";
+  {
+    std::array<std::array<int, kSectors>, kRings> counts{};
+    int most = 1;
+    for (const Point& point : points) {
+      const Eigen::Vector2d offset = point.pixel - center;
+      const int ring = std::min(kRings - 1, static_cast<int>(offset.norm() / radius * kRings));
+      const double turn = std::atan2(offset.y(), offset.x()) / (2 * kPi) + 1.0;
+      int& count = counts[ring][static_cast<int>(turn * kSectors) % kSectors];
+      most = std::max(most, ++count);
+    }
+    Plot plot(520, 300, 0, kSectors, 0, kRings);
+    for (int ring = 0; ring < kRings; ++ring) {
+      for (int sector = 0; sector < kSectors; ++sector) {
+        const double full = std::sqrt(counts[ring][sector] / static_cast<double>(most));
+        plot.color(1 - 0.8 * full, 1 - 0.4 * full, 1 - 0.8 * full);
+        plot.box(sector, ring, sector + 1, ring + 1);
+        plot.color(0, 0, 0);
+        plot.text(plot.x(sector + 0.3), plot.y(ring + 0.4), std::to_string(counts[ring][sector]));
+      }
+    }
+    figure(plot.finish("sector of 30 degrees, from right over down", "ring of radius"),
+           "Corners by radius and sector");
+  }
+  if (result.file.covariance) {
+    const ProjectionField field = projectionUncertainty(lens, *result.file.covariance, size, 48);
+    Plot plot(520, height, 0, field.cols, field.rows, 0);
+    for (int y = 0; y < field.rows; ++y) {
+      for (int x = 0; x < field.cols; ++x) {
+        const double sigma = field.at(x, y);
+        if (std::isnan(sigma)) {
+          plot.color(0.8, 0.8, 0.8);
+        } else {
+          const double level = std::sqrt(sigma / std::max(field.max_px, 1e-12));
+          plot.color(level, 0.9 - 0.6 * level, 1.0 - level);
+        }
+        plot.box(x, y, x + 1, y + 1);
+      }
+    }
+    figure(plot.finish("column of the grid", "row"),
+           "Projection uncertainty: RMS " + fixed(field.rms_px, 3) + " px, at most " +
+               fixed(field.max_px, 3) + " px (red); grey is beyond the calibrated field");
+  }
+  {
+    Plot plot(520, 300, 0, lens.maxTheta() * 180 / kPi, 0, radius * 1.1);
+    plot.color(0.8, 0.2, 0.1);
+    double last_theta = 0.0;
+    double last_radius = 0.0;
+    for (int i = 1; i <= 200; ++i) {
+      const double theta = 0.9999 * lens.maxTheta() * i / 200.0;
+      const auto pixel = lens.project({std::sin(theta), 0.0, std::cos(theta)});
+      if (!pixel) break;
+      const double r = (*pixel - center).norm();
+      plot.line(last_theta, last_radius, theta * 180 / kPi, r);
+      last_theta = theta * 180 / kPi;
+      last_radius = r;
+    }
+    figure(plot.finish("angle off the axis [degrees]", "radius [px]"), "Lens profile along +x");
+  }
+
+  html += "<h2>Models tried</h2>\n<table>\n" +
+          row({"structure", "RMS [px]", "held-out RMS [px]"}, "th");
+  for (const CandidateResult& candidate : result.candidates) {
+    std::string line = row({escaped(structureText(candidate.structure)), fixed(candidate.rms_px, 4),
+                            candidate.holdout_rms_px ? fixed(*candidate.holdout_rms_px, 4) : "-"});
+    if (candidate.chosen) line.replace(0, 4, "<tr class=\"chosen\">");
+    html += line;
+  }
+  html += "</table>\n<h2>Views</h2>\n<table>\n" +
+          row({"view", "corners", "RMS [px]", "used", "why not"}, "th");
+  for (const ViewResult& view : result.views) {
+    html += row({escaped(view.name), std::to_string(view.residuals.size()),
+                 view.used ? fixed(view.rms_px, 4) : "-", view.used ? "yes" : "no",
+                 escaped(view.reason)});
+  }
+  return html + "</table>\n</body></html>\n";
+}
+
+}  // namespace omnister::tools
