@@ -123,7 +123,8 @@ void CalibrationServer::execute(const CalibrateGoalConstPtr& goal) {
     finish("");
     server_->setSucceeded(result, result.message);
   } catch (const Preempted&) {
-    mover_->cancelGoal();
+    if (moving_) mover_->cancelGoal();
+    moving_ = false;
     finish("cancelled");
     result.message = "cancelled";
     server_->setPreempted(result, result.message);
@@ -172,13 +173,16 @@ void CalibrationServer::moveTo(double position) {
   MoveStageGoal goal;
   goal.position = position;
   mover_->sendGoal(goal);
+  moving_ = true;
   while (!mover_->waitForResult(ros::Duration(0.1))) {
     checkPreempted();
     if ((ros::SteadyTime::now() - start).toSec() > kMoveTimeout) {
       mover_->cancelGoal();
+      moving_ = false;
       throw Error("the stage did not arrive at " + std::to_string(position) + " m in time");
     }
   }
+  moving_ = false;
   const auto result = mover_->getResult();
   if (mover_->getState() != actionlib::SimpleClientGoalState::SUCCEEDED || !result ||
       !result->success)

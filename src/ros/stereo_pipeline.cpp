@@ -6,10 +6,11 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <opencv2/imgcodecs.hpp>
 #include <utility>
 
+#include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
+#include "omnister/common/image_file.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/stereo_messages.h"
@@ -28,15 +29,7 @@ constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said
 
 cv::Mat loadMask(const std::string& path) {
   if (path.empty()) return {};
-  cv::Mat mask;
-  try {
-    mask = cv::imread(path, cv::IMREAD_GRAYSCALE);
-  } catch (const cv::Exception& error) {
-    throw InputError(path, "", "is no readable image: " + std::string(error.what()));
-  }
-  if (mask.empty())
-    throw InputError(path, "", "is no readable image, expected a mask (0 leaves out)");
-  return mask;
+  return readImage(path, ImageColor::kGray);
 }
 
 bool sameGeometry(const StereoGeometry& a, const StereoGeometry& b) {
@@ -113,9 +106,16 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       diagnostics_(node, private_node) {
   const std::vector<std::string> prefixes =
       parameters_.rig ? std::vector<std::string>{"left/", "right/"} : std::vector<std::string>{""};
+  std::string files[] = {parameters_.lens, parameters_.lens_displaced};
+  if (parameters_.rig && !parameters_.rig_file.empty()) {
+    const RigFile rig = readRigFile(parameters_.rig_file);
+    T_left_right_ = rig.T_ref_disp;
+    if (files[0].empty()) files[0] = rig.reference.string();
+    if (files[1].empty()) files[1] = rig.displaced.string();
+  }
   for (std::size_t i = 0; i < eyes_.size(); ++i) {
     eyes_[i].topic = node_.resolveName(prefixes[i] + "image_raw");
-    const std::string& file = i == 0 ? parameters_.lens : parameters_.lens_displaced;
+    const std::string& file = files[i];
     if (!file.empty()) {
       eyes_[i].lens = readLensFile(file);
       eyes_[i].lens_from_file = true;

@@ -95,6 +95,7 @@ class CalibrationServer {
 
   std::thread worker_;
   std::unique_ptr<Mover> mover_;
+  bool moving_ = false;  ///< the stage, by our goal; thread of execute() only
   std::unique_ptr<Server> server_;
   diagnostic_updater::Updater diagnostics_;
   ros::SteadyTimer diagnostics_timer_;

@@ -35,7 +35,7 @@ struct StereoParameters {
   std::string lens;  ///< lens file of the (left) camera; empty: topic lens_model
   std::string
       lens_displaced;    ///< rig: lens file of the right camera; empty: topic, or the rig file
-  std::string rig_file;  ///< rig: T_left_right; empty: tf between the images' frames
+  std::string rig_file;  ///< rig: pose and lenses of both; empty: tf between the images' frames
   std::string fixed_frame = "stage_base";  ///< stage: camera poses are taken in this tf frame
   PairingOptions pairing;
   double max_skew = 0.02;   ///< rig: between the stamps of left and right [s]

@@ -1,0 +1,448 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <gmock/gmock.h>
+#include <sensor_msgs/PointCloud2.h>
+#include <tf2_ros/static_transform_broadcaster.h>
+#include <tf2_ros/transform_broadcaster.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cmath>
+#include <filesystem>
+#include <limits>
+#include <memory>
+#include <opencv2/core.hpp>
+#include <opencv2/imgproc.hpp>
+
+#include "omnister/calibration/rig_file.h"
+#include "omnister/lens/lens_models.h"
+#include "omnister/ros/conversions.h"
+#include "omnister/ros/stereo_messages.h"
+#include "omnister/ros/stereo_pipeline.h"
+#include "omnister/sim/renderer.h"
+#include "ros/ros_test.h"
+
+namespace omnister {
+namespace {
+
+using test::Collector;
+using test::eventually;
+
+const std::string kSource = OMNISTER_SOURCE_DIR;
+constexpr double kBaseline = 0.2;
+
+/// A fisheye of about 180 degrees; small, so that tests are quick.
+LensFile lensFile() {
+  LensFile file;
+  file.image_size = {400, 300};
+  LensStructure structure;
+  structure.model = "conic";
+  file.lens = makeLens(structure, {201.3, 148.2}, 400.0 / 3.1, 1.6);
+  return file;
+}
+
+/// Its file, there as long as the tests run.
+const std::string& lensPath() {
+  struct Folder {
+    std::filesystem::path path = std::filesystem::temp_directory_path() /
+                                 ("omnister_stereo_test." + std::to_string(getpid()));
+    std::string file = (path / "lens.yaml").string();
+    Folder() {
+      std::filesystem::create_directories(path);
+      writeLensFile(file, lensFile());
+    }
+    ~Folder() { std::filesystem::remove_all(path); }
+  };
+  static const Folder folder;
+  return folder.file;
+}
+
+/// Two rendered views of the room, a step to the right apart, and the truth of the second.
+struct Views {
+  LensFile lens = lensFile();
+  cv::Mat left;
+  cv::Mat right;  // CV_8UC3
+  cv::Mat right_range;
+
+  Views() {
+    const sim::ScenePtr scene = sim::readScene(kSource + "/config/scenes/room.yaml");
+    const sim::Renderer renderer(*lens.lens, lens.image_size);
+    sim::RenderOptions options;
+    options.adaptive = true;
+    left = renderer.render(*scene, Pose::Identity(), options).image;
+    const sim::Rendering rendering =
+        renderer.render(*scene, Pose(Eigen::Translation3d(kBaseline, 0, 0)), options);
+    right = rendering.image;
+    right_range = rendering.range;
+  }
+};
+
+const Views& views() {
+  static const Views instance;
+  return instance;
+}
+
+/// A camera on a stage as its messages show it.
+class Camera {
+ public:
+  explicit Camera(const std::string& name)
+      : node_(name),
+        base_(name + "_base"),
+        optical_(name + "_optical"),
+        images_(node_.advertise<sensor_msgs::Image>("image_raw", 10)) {}
+
+  /// Rests at `x` [m] around `stamp`.
+  void rest(double x, const ros::Time& stamp) {
+    for (const double offset : {-0.2, -0.1, 0.0, 0.1, 0.2}) {
+      transforms_.sendTransform(toTransformStamped(Pose(Eigen::Translation3d(x, 0, 0)),
+                                                   stamp + ros::Duration(offset), base_, optical_));
+    }
+  }
+  void publish(sensor_msgs::ImagePtr image, const ros::Time& stamp) {
+    image->header.stamp = stamp;
+    image->header.frame_id = optical_;
+    images_.publish(image);
+  }
+  int listeners() const { return static_cast<int>(images_.getNumSubscribers()); }
+  const std::string& base() const { return base_; }
+  const std::string& optical() const { return optical_; }
+  ros::NodeHandle& node() { return node_; }
+
+ private:
+  ros::NodeHandle node_;
+  std::string base_;
+  std::string optical_;
+  ros::Publisher images_;
+  tf2_ros::TransformBroadcaster transforms_;
+};
+
+ros::NodeHandle parametersFor(const Camera& camera, const std::string& name) {
+  ros::NodeHandle node("~" + name);
+  node.setParam("lens", lensPath());
+  node.setParam("fixed_frame", camera.base());
+  node.setParam("min_baseline", 0.1);
+  node.setParam("max_baseline", 0.3);
+  node.setParam("max_range", 20.0);
+  return node;
+}
+
+/// Publishes the pair with the given stamps, when everybody is there to hear it.
+void publishPair(Camera& camera, const ros::Time& first, const ros::Time& second) {
+  ASSERT_TRUE(eventually([&] { return camera.listeners() > 0; }));
+  camera.rest(0.0, first);
+  camera.publish(toImage(views().left, "bgr8"), first);
+  camera.rest(kBaseline, second);
+  camera.publish(toImage(views().right, "bgr8"), second);
+}
+
+double medianError(const cv::Mat& range, const cv::Mat& truth, double* share) {
+  std::vector<double> errors;
+  int known = 0;
+  for (int v = 0; v < truth.rows; ++v)
+    for (int u = 0; u < truth.cols; ++u) {
+      if (std::isnan(truth.at<float>(v, u))) continue;
+      ++known;
+      if (std::isnan(range.at<float>(v, u))) continue;
+      errors.push_back(std::abs(range.at<float>(v, u) / truth.at<float>(v, u) - 1.0));
+    }
+  *share = known > 0 ? static_cast<double>(errors.size()) / known : 0.0;
+  if (errors.empty()) return std::numeric_limits<double>::infinity();
+  std::nth_element(errors.begin(), errors.begin() + errors.size() / 2, errors.end());
+  return errors[errors.size() / 2];
+}
+
+cv::Mat floats(const sensor_msgs::Image& image) {
+  return cv::Mat(static_cast<int>(image.height), static_cast<int>(image.width), CV_32FC1,
+                 const_cast<std::uint8_t*>(image.data.data()), image.step);
+}
+
+TEST(Stereo, CloudDepthAndRangeAgreeWithTheScene) {
+  Camera camera("truth");
+  const StereoPipeline stereo(camera.node(), parametersFor(camera, "truth"));
+  Collector<sensor_msgs::PointCloud2> points(camera.node(), "points2");
+  Collector<sensor_msgs::Image> depths(camera.node(), "depth");
+  Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+  const ros::Time stamp = ros::Time::now();
+  publishPair(camera, stamp - ros::Duration(2.0), stamp);
+  ASSERT_TRUE(eventually([&] { return points.size() && depths.size() && ranges.size(); }));
+
+  for (const auto& header : {points.last()->header, depths.last()->header, ranges.last()->header}) {
+    EXPECT_EQ(header.stamp, stamp) << "the newest frame is the reference";
+    EXPECT_EQ(header.frame_id, camera.optical());
+  }
+  EXPECT_EQ(ranges.last()->encoding, "32FC1");
+  EXPECT_EQ(depths.last()->encoding, "32FC1");
+  double share = 0.0;
+  const cv::Mat range = floats(*ranges.last());
+  ASSERT_EQ(range.size(), views().right.size());
+  EXPECT_LT(medianError(range, views().right_range, &share), 0.02);
+  EXPECT_GT(share, 0.6);
+
+  const auto& message = *points.last();
+  EXPECT_FALSE(message.is_dense);
+  EXPECT_EQ(message.point_step * message.width, message.row_step);
+  const Cloud cloud = fromPointCloud(message);
+  ASSERT_EQ(cloud.xyz.size(), range.size());
+  EXPECT_EQ(cv::norm(cloud.bgr, views().right, cv::NORM_INF), 0.0) << "colour of the image";
+  const cv::Mat depth = floats(*depths.last());
+  int valid = 0;
+  for (int v = 0; v < range.rows; ++v)
+    for (int u = 0; u < range.cols; ++u) {
+      const cv::Vec3f xyz = cloud.xyz.at<cv::Vec3f>(v, u);
+      const float expected = range.at<float>(v, u);
+      if (std::isnan(expected)) {
+        ASSERT_TRUE(std::isnan(xyz[0]) && std::isnan(xyz[1]) && std::isnan(xyz[2]));
+        ASSERT_TRUE(std::isnan(depth.at<float>(v, u)));
+        continue;
+      }
+      ++valid;
+      ASSERT_NEAR(cv::norm(xyz), expected, 1e-4 * expected);
+      const auto ray =
+          views().lens.lens->unproject({static_cast<double>(u), static_cast<double>(v)});
+      ASSERT_TRUE(ray);
+      ASSERT_NEAR(xyz[0], ray->x() * expected, 1e-3 * expected);
+      ASSERT_NEAR(xyz[2], ray->z() * expected, 1e-3 * expected);
+      if (xyz[2] > 0.0F)
+        ASSERT_EQ(depth.at<float>(v, u), xyz[2]);
+      else
+        ASSERT_TRUE(std::isnan(depth.at<float>(v, u))) << "at or past 90 degrees";
+      ASSERT_GT(cloud.sigma.at<float>(v, u), 0.0F);
+      ASSERT_TRUE(cloud.score.at<float>(v, u) >= 0.0F && cloud.score.at<float>(v, u) <= 1.0F);
+    }
+  EXPECT_GT(valid, range.rows * range.cols / 3);
+}
+
+TEST(Stereo, ListensToImagesOnlyWhileSomebodyListensToIt) {
+  Camera camera("lazy");
+  const StereoPipeline stereo(camera.node(), parametersFor(camera, "lazy"));
+  ros::WallDuration(0.3).sleep();
+  EXPECT_EQ(camera.listeners(), 0);
+  for (const std::string topic : {"points2", "depth", "range"}) {
+    using Points = Collector<sensor_msgs::PointCloud2>;
+    using Images = Collector<sensor_msgs::Image>;
+    std::unique_ptr<Points> points;
+    std::unique_ptr<Images> images;
+    if (topic == "points2")
+      points = std::make_unique<Points>(camera.node(), topic);
+    else
+      images = std::make_unique<Images>(camera.node(), topic);
+    EXPECT_TRUE(eventually([&] { return camera.listeners() == 1; })) << topic;
+    points.reset();
+    images.reset();
+    EXPECT_TRUE(eventually([&] { return camera.listeners() == 0; })) << topic;
+  }
+}
+
+TEST(Stereo, GoesOnAfterEveryKindOfBadMessage) {
+  Camera camera("bad");
+  const StereoPipeline stereo(camera.node(), parametersFor(camera, "bad"));
+  Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+  ASSERT_TRUE(eventually([&] { return camera.listeners() > 0; }));
+  const ros::Time start = ros::Time::now();
+  int sent = 0;
+  const auto spoil = [&](const std::function<void(sensor_msgs::Image&)>& change) {
+    const sensor_msgs::ImagePtr image = toImage(views().left, "bgr8");
+    change(*image);
+    camera.publish(image, start + ros::Duration(0.001 * ++sent));
+    ros::WallDuration(0.02).sleep();  // so that none is lost in a queue
+  };
+  spoil([](sensor_msgs::Image& image) { image.encoding = "nonsense"; });
+  spoil([](sensor_msgs::Image& image) { image.encoding = "8UC999999999"; });
+  spoil([](sensor_msgs::Image& image) { image.encoding = "32FC1"; });
+  spoil([](sensor_msgs::Image& image) { image.encoding.assign(100000, '\x1b'); });
+  spoil([](sensor_msgs::Image& image) { image.step = 1; });
+  spoil([](sensor_msgs::Image& image) { image.step = 0xffffffffu; });
+  spoil([](sensor_msgs::Image& image) { image.data.resize(image.data.size() / 2); });
+  spoil([](sensor_msgs::Image& image) { image.data.clear(); });
+  spoil([](sensor_msgs::Image& image) { image.width = image.height = 0; });
+  spoil([](sensor_msgs::Image& image) { image.width = image.height = 0xffffffffu; });
+  spoil([](sensor_msgs::Image& image) {
+    image.width = image.height = 1;
+    image.step = 3;
+    image.data.resize(3);
+  });
+  // A stamp of none, one in the far future, and a frame nobody knows.
+  camera.publish(toImage(views().left, "bgr8"), ros::Time());
+  camera.publish(toImage(views().left, "bgr8"), start + ros::Duration(1e6));
+  // A pose that is no pose; tf refuses it or the node does.
+  geometry_msgs::TransformStamped nan =
+      toTransformStamped(Pose::Identity(), ros::Time::now(), camera.base(), camera.optical());
+  nan.transform.translation.x = std::numeric_limits<double>::quiet_NaN();
+  tf2_ros::TransformBroadcaster().sendTransform(nan);
+
+  const ros::Time stamp = ros::Time::now() + ros::Duration(0.5);
+  camera.rest(0.0, stamp);
+  camera.publish(toImage(views().left, "bgr8"), stamp);
+  camera.rest(kBaseline, stamp + ros::Duration(1.0));
+  camera.publish(toImage(views().right, "bgr8"), stamp + ros::Duration(1.0));
+  EXPECT_TRUE(eventually([&] { return ranges.size() > 0; }));
+}
+
+TEST(Stereo, ImagesOfAnyDepthAndColourGiveTheSameCloud) {
+  cv::Mat left, right;
+  cv::cvtColor(views().left, left, cv::COLOR_BGR2GRAY);
+  cv::cvtColor(views().right, right, cv::COLOR_BGR2GRAY);
+  // 12 significant bits in 16, as cameras send them.
+  cv::Mat left12, right12;
+  left.convertTo(left12, CV_16U, 16.0);
+  right.convertTo(right12, CV_16U, 16.0);
+  struct Case {
+    std::string encoding;
+    cv::Mat left, right;
+  };
+  std::vector<cv::Mat> results;
+  int number = 0;
+  for (const Case& c : {Case{"mono8", left, right}, Case{"mono16", left12, right12},
+                        Case{"16UC1", left12, right12}}) {
+    Camera camera("depth" + std::to_string(number++));
+    const StereoPipeline stereo(camera.node(), parametersFor(camera, camera.base()));
+    Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+    ASSERT_TRUE(eventually([&] { return camera.listeners() > 0; }));
+    const ros::Time stamp = ros::Time::now();
+    camera.rest(0.0, stamp - ros::Duration(2.0));
+    camera.publish(toImage(c.left, c.encoding), stamp - ros::Duration(2.0));
+    camera.rest(kBaseline, stamp);
+    camera.publish(toImage(c.right, c.encoding), stamp);
+    ASSERT_TRUE(eventually([&] { return ranges.size() > 0; })) << c.encoding;
+    results.push_back(floats(*ranges.last()).clone());
+    double share = 0.0;
+    EXPECT_LT(medianError(results.back(), views().right_range, &share), 0.02) << c.encoding;
+    EXPECT_GT(share, 0.6) << c.encoding;
+  }
+  // 4080 of 4095 at the brightest: the same grey levels but for rounding.
+  for (const cv::Mat& result : results) {
+    cv::Mat both = (result == result) & (results[0] == results[0]);
+    EXPECT_GT(cv::countNonZero(both), 0.95 * cv::countNonZero(results[0] == results[0]));
+  }
+}
+
+/// Plays a pair of two cameras into a node set up by parameters. @param name namespace, unique
+void expectRangeFromTwoCameras(const std::string& name, ros::NodeHandle private_node) {
+  ros::NodeHandle node(name);
+  private_node.setParam("mode", "rig");
+  private_node.setParam("max_range", 20.0);
+  const StereoPipeline stereo(node, private_node);
+  Collector<sensor_msgs::Image> ranges(node, "range");
+  ros::Publisher left = node.advertise<sensor_msgs::Image>("left/image_raw", 5);
+  ros::Publisher right = node.advertise<sensor_msgs::Image>("right/image_raw", 5);
+  ASSERT_TRUE(eventually([&] { return left.getNumSubscribers() && right.getNumSubscribers(); }));
+  // The reference is the left topic; here it carries the view whose truth is known.
+  const sensor_msgs::ImagePtr reference = toImage(views().right, "bgr8");
+  const sensor_msgs::ImagePtr displaced = toImage(views().left, "bgr8");
+  reference->header.frame_id = name + "_left";
+  displaced->header.frame_id = name + "_right";
+  const bool came = eventually([&] {
+    reference->header.stamp = ros::Time::now();
+    displaced->header.stamp = reference->header.stamp + ros::Duration(0.003);
+    left.publish(reference);
+    right.publish(displaced);
+    ros::WallDuration(0.2).sleep();
+    return ranges.size() > 0;
+  });
+  ASSERT_TRUE(came);
+  EXPECT_EQ(ranges.last()->header.frame_id, name + "_left");
+  double share = 0.0;
+  EXPECT_LT(medianError(floats(*ranges.last()), views().right_range, &share), 0.02);
+  EXPECT_GT(share, 0.6);
+}
+
+TEST(Stereo, TwoCamerasWithTheirPoseFromTf) {
+  ros::NodeHandle private_node("~by_tf");
+  private_node.setParam("lens", lensPath());
+  private_node.setParam("lens_displaced", lensPath());
+  tf2_ros::StaticTransformBroadcaster transforms;
+  transforms.sendTransform(toTransformStamped(Pose(Eigen::Translation3d(-kBaseline, 0, 0)),
+                                              ros::Time::now(), "by_tf_left", "by_tf_right"));
+  expectRangeFromTwoCameras("by_tf", private_node);
+}
+
+TEST(Stereo, TwoCamerasWithTheirPoseAndLensesFromTheRigFile) {
+  const std::string rig_path =
+      (std::filesystem::path(lensPath()).parent_path() / "rig.yaml").string();
+  RigFile rig;
+  rig.reference = rig.displaced = lensPath();
+  rig.T_ref_disp = Pose(Eigen::Translation3d(-kBaseline, 0, 0));
+  writeRigFile(rig_path, rig);
+  ros::NodeHandle private_node("~by_file");
+  private_node.setParam("rig", rig_path);
+  expectRangeFromTwoCameras("by_file", private_node);
+}
+
+TEST(Stereo, TakesTheLensFromTheTopicAndTheLaterOneWins) {
+  Camera camera("topic");
+  ros::NodeHandle private_node = parametersFor(camera, "topic");
+  private_node.deleteParam("lens");
+  const StereoPipeline stereo(camera.node(), private_node);
+  Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+  ros::Publisher lenses = camera.node().advertise<LensModelMessage>("lens_model", 3, true);
+  ASSERT_TRUE(eventually([&] { return lenses.getNumSubscribers() > 0; }));
+  std_msgs::Header header;
+  header.frame_id = camera.optical();
+  header.stamp = ros::Time::now();
+  lenses.publish(toLensModelMessage(views().lens, header));
+  // Neither an older lens nor a broken message takes its place.
+  LensFile other = views().lens;
+  other.image_size = {17, 17};
+  header.stamp -= ros::Duration(100.0);
+  lenses.publish(toLensModelMessage(other, header));
+  LensModelMessage broken = toLensModelMessage(views().lens, header);
+  broken.header.stamp = ros::Time::now() + ros::Duration(1.0);
+  broken.yaml = "lens_surface: {version: 1, model: [[[";
+  lenses.publish(broken);
+  ros::WallDuration(0.3).sleep();
+  const ros::Time stamp = ros::Time::now();
+  publishPair(camera, stamp - ros::Duration(2.0), stamp);
+  EXPECT_TRUE(eventually([&] { return ranges.size() > 0; }));
+}
+
+TEST(Stereo, RefusesParametersByName) {
+  const auto refusal = [](const std::string& name, const std::string& value) -> std::string {
+    ros::NodeHandle private_node("~refused");
+    private_node.setParam(name, value);
+    std::string message = "taken";
+    try {
+      StereoPipeline stereo(ros::NodeHandle("refused"), private_node);
+    } catch (const Error& error) {
+      message = error.what();
+    }
+    private_node.deleteParam(name);
+    return message;
+  };
+  using testing::HasSubstr;
+  EXPECT_THAT(refusal("mode", "three"), HasSubstr("mode"));
+  EXPECT_THAT(refusal("positions", "0"), HasSubstr("positions"));
+  EXPECT_THAT(refusal("min_baseline", "nan"), HasSubstr("min_baseline"));
+  EXPECT_THAT(refusal("min_baseline", "5"), HasSubstr("max_baseline"));
+  EXPECT_THAT(refusal("max_range", "-1"), HasSubstr("max_range"));
+  EXPECT_THAT(refusal("matcher", "magic"), HasSubstr("matcher"));
+  EXPECT_THAT(refusal("mask", "/none.png"), HasSubstr("/none.png"));
+  EXPECT_THAT(refusal("lens", "/none.yaml"), HasSubstr("/none.yaml"));
+}
+
+TEST(StereoMessages, CloudsComeBackAsTheyWent) {
+  Cloud cloud{cv::Mat(3, 5, CV_32FC3), cv::Mat(3, 5, CV_8UC3), cv::Mat(3, 5, CV_32FC1),
+              cv::Mat(3, 5, CV_32FC1)};
+  cv::randu(cloud.xyz, -5.0F, 5.0F);
+  cv::randu(cloud.bgr, 0, 255);
+  cv::randu(cloud.sigma, 0.0F, 1.0F);
+  cv::randu(cloud.score, 0.0F, 1.0F);
+  const sensor_msgs::PointCloud2Ptr message = toPointCloud(cloud, {});
+  const Cloud back = fromPointCloud(*message);
+  EXPECT_EQ(cv::norm(back.xyz, cloud.xyz, cv::NORM_INF), 0.0);
+  EXPECT_EQ(cv::norm(back.bgr, cloud.bgr, cv::NORM_INF), 0.0);
+  EXPECT_EQ(cv::norm(back.sigma, cloud.sigma, cv::NORM_INF), 0.0);
+  EXPECT_EQ(cv::norm(back.score, cloud.score, cv::NORM_INF), 0.0);
+  sensor_msgs::PointCloud2 spoiled = *message;
+  spoiled.data.pop_back();
+  EXPECT_THROW(fromPointCloud(spoiled), InputError);
+  spoiled = *message;
+  spoiled.width = 0xffffffffu;
+  EXPECT_THROW(fromPointCloud(spoiled), InputError);
+  spoiled = *message;
+  spoiled.fields[3].name = "intensity";
+  EXPECT_THROW(fromPointCloud(spoiled), InputError);
+}
+
+}  // namespace
+}  // namespace omnister
+
+int main(int argc, char** argv) { return omnister::test::runTests(argc, argv, "stereo_test"); }
