@@ -25,12 +25,13 @@ using namespace sweep;
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 constexpr float kFullCost = kWindow * kWindow * kBits;  ///< every bit of every descriptor wrong
-constexpr int kTileWidth = 96, kTileHeight = 40;
-constexpr float kMiddleX = 48, kMiddleY = 20;  ///< where planes are fitted about
+constexpr int kTileWidth = 64, kTileHeight = 48;
+constexpr float kMiddleX = 32, kMiddleY = 24;  ///< where planes are fitted about
 constexpr int kNarrowLanes = 14;               ///< hypotheses of the cheapest chunk
 constexpr int kSearchMargin = 3;               ///< columns beyond what the coarser level found
 constexpr int kClaimTolerance = 6;    ///< quarters of a column that two claims may differ by
-constexpr int kSpeckle = 100;         ///< regions of fewer pixels go
+constexpr int kSpeckle = 100;         ///< regions of fewer pixels go,
+constexpr int kSpeckleShare = 3000;   ///< or of less than this part of the image
 constexpr float kWorstShare = 0.36f;  ///< of it, that a match may cost; chance gives a half
 
 class Stopwatch {
@@ -627,7 +628,9 @@ class SweepMatcher : public Matcher {
       }
     });
     watch->lap("median");
-    rejected["speckle"] = removeSpeckles(&smooth_, finest_step_, kSpeckle, options_.threads);
+    rejected["speckle"] =
+        removeSpeckles(&smooth_, finest_step_, std::max(kSpeckle, width * height / kSpeckleShare),
+                       options_.threads);
     watch->lap("speckle");
 
     // Planes that nobody holds any more are used again: fresh memory costs a millisecond.
