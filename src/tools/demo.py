@@ -5,6 +5,7 @@ is carried before it, scans the room, and shows or saves the result. It starts i
 free port, and ends every process it started, and only these."""
 
 import argparse
+import logging
 import os
 import shutil
 import signal
@@ -113,6 +114,8 @@ class Rig:
         self.rospy, self.msg, self.clock = rospy, omnister.msg, clock
         self.Image, self.PointCloud2, self.SetBool, self.Trigger = Image, PointCloud2, SetBool, Trigger
         rospy.init_node('demo', disable_signals=True)
+        # When rviz is closed the master goes first; that this node cannot sign off is no news.
+        logging.getLogger('rosout').setLevel(logging.ERROR)
         self.stage_state = None
         self.cloud_stamp = 0.0
         self.clouds = 0
