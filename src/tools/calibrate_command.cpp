@@ -6,12 +6,14 @@
 #include "calibration_arguments.h"
 #include "calibration_report.h"
 #include "omnister/common/error.h"
+#include "procedure_command.h"
 
 namespace omnister::tools {
 namespace {
 
 struct Arguments {
   CalibrationArguments common;
+  ProcedureArguments procedure;
   std::vector<std::string> images;
   std::string detections_file;
   std::string out;
@@ -52,6 +54,7 @@ void addCalibrate(CLI::App& app) {
       "calibrate", "Fit a lens to images of a board, or to corners found in them");
   const auto arguments = std::make_shared<Arguments>();
   addCalibrationArguments(*command, arguments->common);
+  addProcedureArguments(*command, arguments->procedure);
   command->add_option("images", arguments->images, "Images of the board (with --target)");
   command->add_option(
       "--detections", arguments->detections_file,
@@ -67,10 +70,18 @@ void addCalibrate(CLI::App& app) {
     if (from_file && command->count("--size") == 0) {
       throw CLI::RequiredError("--size WxH (with --detections)");
     }
-    if (!from_file && arguments->common.target_file.empty()) {
+    const ProcedureArguments& procedure = arguments->procedure;
+    if (!from_file && procedure.name != "lines" && arguments->common.target_file.empty()) {
       throw CLI::RequiredError("--target TARGET.yaml (with images)");
     }
-    run(*arguments);
+    if (procedure.name.empty()) {
+      for (const char* option : {"--center", "--sweep", "--roi"}) {
+        if (command->count(option) > 0) throw CLI::RequiresError(option, "--procedure");
+      }
+      return run(*arguments);
+    }
+    runProcedure(procedure, arguments->common, arguments->images, arguments->detections_file,
+                 arguments->out, *arguments->json);
   });
 }
 
