@@ -11,11 +11,12 @@
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_models.h"
 #include "yaml_view.h"
+#include "yaml_write.h"
 
 namespace omnister {
 namespace {
 
-using detail::YamlView;
+using namespace detail;
 
 constexpr int kVersion = 1;
 constexpr std::size_t kMaxBytes = 4u << 20;
@@ -72,74 +73,6 @@ Eigen::MatrixXd readCovariance(const YamlView& entry, int size) {
     }
   }
   return out;
-}
-
-// ---------------------------------------------------------------- writing
-
-// YAML 1.1 readers take 1e-05 for text: they want a point in it.
-std::string yamlNumber(double value) {
-  std::string out = formatNumber(value);
-  const std::size_t exponent = out.find('e');
-  if (exponent != std::string::npos && out.find('.') == std::string::npos) {
-    out.insert(exponent, ".0");
-  }
-  return out;
-}
-
-template <typename Numbers>
-std::string flow(const Numbers& numbers) {
-  std::string out = "[";
-  for (const double value : numbers) {
-    if (out.size() > 1) out += ", ";
-    out += yamlNumber(value);
-  }
-  return out + "]";
-}
-
-template <typename Derived>
-std::string rowMajor(const Eigen::MatrixBase<Derived>& matrix) {
-  std::vector<double> out;
-  for (int i = 0; i < matrix.rows(); ++i) {
-    for (int j = 0; j < matrix.cols(); ++j) out.push_back(matrix(i, j));
-  }
-  return flow(out);
-}
-
-// Plain when no YAML reader could take it for anything but a word.
-std::string yamlText(const std::string& text) {
-  const auto letter = [](char c) {
-    return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || c == '_';
-  };
-  static const std::vector<std::string> kReserved{"null", "true", "false", "yes", "no", "on",
-                                                  "off",  "y",    "n",     "nan", "inf"};
-  std::string lower;
-  bool plain = !text.empty() && letter(text[0]);
-  for (const char c : text) {
-    plain = plain && (letter(c) || (c >= '0' && c <= '9') || c == '-' || c == '.' || c == '/');
-    lower += static_cast<char>(c >= 'A' && c <= 'Z' ? c - 'A' + 'a' : c);
-  }
-  if (plain && std::find(kReserved.begin(), kReserved.end(), lower) == kReserved.end()) return text;
-  std::string out = "\"";
-  static constexpr char kHex[] = "0123456789ABCDEF";
-  for (const char c : text) {
-    const auto byte = static_cast<unsigned char>(c);
-    if (c == '"' || c == '\\') {
-      out += '\\';
-      out += c;
-    } else if (byte < 0x20 || byte == 0x7F) {
-      out += "\\x";
-      out += kHex[byte >> 4];
-      out += kHex[byte & 15];
-    } else {
-      out += c;
-    }
-  }
-  return out + "\"";
-}
-
-std::string matrixBlock(const std::string& key, int rows, int cols, const std::string& data) {
-  return key + ":\n  rows: " + std::to_string(rows) + "\n  cols: " + std::to_string(cols) +
-         "\n  data: " + data + "\n";
 }
 
 }  // namespace
@@ -207,31 +140,18 @@ std::string formatLensFile(const LensFile& file) {
   const LensModel& lens = *file.lens;
   const auto fit = detail::fitEquidistant(lens, file.image_size);
   const bool standard = fit && fit->worst_residual_px < kStandardBound;
-  Eigen::Matrix<double, 3, 4> P = Eigen::Matrix<double, 3, 4>::Zero();
-  if (standard) P.leftCols<3>() = fit->K;
-
-  std::string out;
-  out += "image_width: " + std::to_string(file.image_size.width) + "\n";
-  out += "image_height: " + std::to_string(file.image_size.height) + "\n";
-  out += "camera_name: " + yamlText(file.camera_name) + "\n";
-  out += matrixBlock("camera_matrix", 3, 3,
-                     rowMajor(standard ? fit->K : Eigen::Matrix3d(Eigen::Matrix3d::Zero())));
-  out += "distortion_model: " + yamlText(standard ? fit->distortion_model : "") + "\n";
-  const std::vector<double> D = standard ? fit->D : std::vector<double>{};
-  out += matrixBlock("distortion_coefficients", 1, static_cast<int>(D.size()), flow(D));
-  out += matrixBlock("rectification_matrix", 3, 3, rowMajor(Eigen::Matrix3d::Identity()));
-  out += matrixBlock("projection_matrix", 3, 4, rowMajor(P));
-
+  std::string out =
+      cameraInfoText(file.image_size, file.camera_name, standard ? *fit : StandardCameraInfo());
   out += "lens_surface:\n";
   out += "  version: " + std::to_string(kVersion) + "\n";
   out += "  model: " + std::string(lens.model()) + "\n";
   const Eigen::Vector2d center = lens.center();
-  out += "  center: " + flow(std::vector<double>{center.x(), center.y()}) + "\n";
+  out += "  center: " + yamlFlow(std::vector<double>{center.x(), center.y()}) + "\n";
   out += "  max_theta: " + yamlNumber(lens.maxTheta()) + "\n";
   out += "  parameters:\n";
   for (const auto& [name, values] : namedParameters(lens)) {
     const bool list = name == "radii";
-    out += "    " + name + ": " + (list ? flow(values) : yamlNumber(values.at(0))) + "\n";
+    out += "    " + name + ": " + (list ? yamlFlow(values) : yamlNumber(values.at(0))) + "\n";
   }
   if (file.covariance) {
     const auto size = lens.parameters().size();
@@ -240,11 +160,12 @@ std::string formatLensFile(const LensFile& file) {
       throw Error("the covariance of a " + std::string(lens.model()) + " lens needs " +
                   std::to_string(size) + " rows and columns of finite numbers");
     }
-    out += "  covariance: " + rowMajor(*file.covariance) + "\n";
+    out += "  covariance: " + yamlRowMajor(*file.covariance) + "\n";
   }
   if (file.stage_axis) {
     out += "  stage_axis: " +
-           flow(std::vector<double>(file.stage_axis->data(), file.stage_axis->data() + 3)) + "\n";
+           yamlFlow(std::vector<double>(file.stage_axis->data(), file.stage_axis->data() + 3)) +
+           "\n";
   }
   const CalibrationRecord& record = file.calibration;
   std::string block;

@@ -22,6 +22,7 @@ void addCalibrate(CLI::App& app);
 void addCalibrateScan(CLI::App& app);
 void addImport(CLI::App& app);
 void addCalibrateStereo(CLI::App& app);
+void addExport(CLI::App& app);
 void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
 void addStereo(CLI::App& app);
@@ -37,6 +38,7 @@ constexpr AddCommand kCommands[] = {
     addCalibrateScan,
     addImport,
     addCalibrateStereo,
+    addExport,
     addProject,
     addUnproject,
     addStereo,
