@@ -20,8 +20,8 @@ namespace omnister::tools {
 // One line a subcommand, in the order of --help.
 void addCalibrate(CLI::App& app);
 void addCalibrateScan(CLI::App& app);
-void addImport(CLI::App& app);
 void addCalibrateStereo(CLI::App& app);
+void addImport(CLI::App& app);
 void addExport(CLI::App& app);
 void addProject(CLI::App& app);
 void addUnproject(CLI::App& app);
@@ -36,8 +36,8 @@ namespace {
 constexpr AddCommand kCommands[] = {
     addCalibrate,
     addCalibrateScan,
-    addImport,
     addCalibrateStereo,
+    addImport,
     addExport,
     addProject,
     addUnproject,
