@@ -1,6 +1,6 @@
 # The catkin side of the package: messages, exports, install destinations.
 set(OMNISTER_CATKIN_COMPONENTS
-  actionlib actionlib_msgs cv_bridge diagnostic_updater dynamic_reconfigure geometry_msgs
+  actionlib actionlib_msgs cv_bridge diagnostic_updater geometry_msgs
   image_transport message_filters message_generation nodelet pluginlib rosbag rosbag_storage roscpp
   sensor_msgs std_msgs std_srvs tf2 tf2_ros visualization_msgs)
 find_package(catkin REQUIRED COMPONENTS ${OMNISTER_CATKIN_COMPONENTS})
@@ -30,3 +30,4 @@ set(CMAKE_RUNTIME_OUTPUT_DIRECTORY ${CATKIN_DEVEL_PREFIX}/${CATKIN_PACKAGE_BIN_D
 
 install(DIRECTORY launch config DESTINATION ${OMNISTER_SHARE_DESTINATION})
 install(FILES nodelet_plugins.xml DESTINATION ${OMNISTER_SHARE_DESTINATION})
+catkin_install_python(PROGRAMS src/tools/demo.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})

@@ -3,6 +3,7 @@
 #include <nodelet/loader.h>
 #include <sensor_msgs/CameraInfo.h>
 #include <sensor_msgs/Image.h>
+#include <sensor_msgs/PointCloud2.h>
 #include <tf2_ros/buffer.h>
 #include <tf2_ros/transform_listener.h>
 
@@ -73,6 +74,36 @@ TEST(CameraNodelet, IsLoadedAndUnloadedWhileItStreams) {
     ASSERT_TRUE(eventually([&] { return !images.connected(); })) << round;
   }
   EXPECT_TRUE(loader.listLoadedNodelets().empty());
+}
+
+TEST(StereoNodelet, IsLoadedAndUnloadedWhileSomebodyListens) {
+  const std::string name = "/come_and_go/stereo";
+  nodelet::Loader loader(false);
+  Collector<sensor_msgs::PointCloud2> clouds(ros::NodeHandle("/come_and_go"), "points2");
+  for (int round = 0; round < 8; ++round) {
+    ASSERT_TRUE(loader.load(name, "omnister/StereoNodelet", {}, {}));
+    if (round % 2 == 0) {
+      ASSERT_TRUE(eventually([&] { return clouds.connected(); })) << round;
+    }
+    ASSERT_TRUE(loader.unload(name));
+    ASSERT_TRUE(eventually([&] { return !clouds.connected(); })) << round;
+  }
+  ros::NodeHandle(name).setParam("matcher", "magic");
+  EXPECT_FALSE(loader.load(name, "omnister/StereoNodelet", {}, {}));
+}
+
+TEST(CalibrationNodelet, IsLoadedAndUnloaded) {
+  const std::string name = "/come_and_go/calibration";
+  ros::NodeHandle parameters(name);
+  nodelet::Loader loader(false);
+  // The target is required.
+  EXPECT_FALSE(loader.load(name, "omnister/CalibrationNodelet", {}, {}));
+  parameters.setParam("target", OMNISTER_SOURCE_DIR "/config/demo/target.yaml");
+  parameters.setParam("store", ::testing::TempDir());
+  for (int round = 0; round < 8; ++round) {
+    ASSERT_TRUE(loader.load(name, "omnister/CalibrationNodelet", {}, {})) << round;
+    ASSERT_TRUE(loader.unload(name));
+  }
 }
 
 TEST(CameraNodelet, DoesNotStartWithBadParameters) {

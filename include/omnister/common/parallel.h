@@ -7,13 +7,15 @@
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
+#include <algorithm>
 #include <cstddef>
 
 namespace omnister {
 
-/// @param threads wanted; 0 or less means every core
+/// @param threads wanted; 0 or less means every core, and there are no more than that
 inline int threadCount(int threads) {
-  return threads > 0 ? threads : tbb::info::default_concurrency();
+  const int cores = tbb::info::default_concurrency();
+  return threads > 0 ? std::min(threads, cores) : cores;
 }
 
 /// Calls body(i) for i in [begin, end) on at most `threads` threads (0: every core). The result must
