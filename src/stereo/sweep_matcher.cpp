@@ -605,8 +605,10 @@ class SweepMatcher : public Matcher {
     std::vector<std::size_t> matched(strips), lost(strips);
     forRows([&](std::size_t s, int begin, int end) {
       for (int y = begin; y < end; ++y) {
-        const std::int32_t* claim = claim_.ptr<std::int32_t>(y);
+        std::int32_t* claim = claim_.ptr<std::int32_t>(y);
         float* h = level.h.ptr<float>(y);
+        // Vectors read past the row, where the last frame left anything.
+        std::fill(claim + width, claim + width + 64, -1);
         matched[s] += width - std::count(claim, claim + width, -1);
         std::fill(h + width, h + width + 64, kNaN);
         lost[s] +=
