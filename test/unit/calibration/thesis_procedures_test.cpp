@@ -10,6 +10,7 @@
 #include <nlohmann/json.hpp>
 #include <random>
 
+#include "command_run.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/image_file.h"
@@ -17,10 +18,12 @@
 #include "omnister/sim/renderer.h"
 #include "omnister/sim/scene.h"
 #include "temporary_folder.h"
-#include "tools/command_line.h"
 
 namespace omnister {
 namespace {
+
+using test::Outcome;
+using test::run;
 
 using ::testing::HasSubstr;
 
@@ -282,23 +285,6 @@ TEST(LineRadius, LeavesOutLinesThroughTheCentre) {
   EXPECT_THROW(calibrateByLines(lines, options), Error);
   options.min_radius = 10.0;
   EXPECT_THROW(calibrateByLines(straightLines(*lens, 0.0), options), Error);
-}
-
-struct Outcome {
-  int code = -1;
-  std::string out, err;
-};
-Outcome run(std::vector<std::string> arguments) {
-  arguments.insert(arguments.begin(), "omnister");
-  std::vector<const char*> argv;
-  for (const std::string& argument : arguments) argv.push_back(argument.c_str());
-  ::testing::internal::CaptureStdout();
-  ::testing::internal::CaptureStderr();
-  Outcome outcome;
-  outcome.code = tools::runCommandLine(static_cast<int>(argv.size()), argv.data());
-  outcome.out = ::testing::internal::GetCapturedStdout();
-  outcome.err = ::testing::internal::GetCapturedStderr();
-  return outcome;
 }
 
 // Images of a dark bench with straight edges, as in fig. 4.3.

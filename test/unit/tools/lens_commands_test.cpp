@@ -11,15 +11,18 @@
 #include <string>
 #include <vector>
 
+#include "command_run.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
 #include "temporary_folder.h"
-#include "tools/command_line.h"
 
 namespace omnister {
 namespace {
+
+using test::Outcome;
+using test::run;
 
 namespace fs = std::filesystem;
 using ::testing::AllOf;
@@ -31,40 +34,6 @@ constexpr char kChain[] =
     "cam0:\n  camera_model: ds\n  intrinsics: [-0.2, 0.59, 300, 310, 640, 480]\n"
     "  distortion_model: none\n  distortion_coeffs: []\n  resolution: [1280, 960]\n"
     "  rostopic: /cam0/image_raw\n";
-
-struct Outcome {
-  int code = -1;
-  std::string out, err;
-
-  std::vector<std::string> lines() const {
-    std::vector<std::string> result;
-    std::istringstream text(out);
-    for (std::string line; std::getline(text, line);) result.push_back(line);
-    return result;
-  }
-};
-
-// Calls with this text on standard input.
-Outcome run(Arguments arguments, const std::string& input = "") {
-  // Before the first call, as it gives std::cin another buffer.
-  std::ios::sync_with_stdio(false);
-  std::istringstream text(input);
-  std::streambuf* before = std::cin.rdbuf(text.rdbuf());
-  std::cin.clear();
-  arguments.insert(arguments.begin(), "omnister");
-  std::vector<const char*> argv;
-  for (const std::string& argument : arguments) argv.push_back(argument.c_str());
-  ::testing::internal::CaptureStdout();
-  ::testing::internal::CaptureStderr();
-  Outcome outcome;
-  outcome.code = tools::runCommandLine(static_cast<int>(argv.size()), argv.data());
-  std::cout.flush();
-  outcome.out = ::testing::internal::GetCapturedStdout();
-  outcome.err = ::testing::internal::GetCapturedStderr();
-  std::cin.rdbuf(before);
-  std::cin.clear();
-  return outcome;
-}
 
 class LensCommands : public ::testing::Test {
  protected:

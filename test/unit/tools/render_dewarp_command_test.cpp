@@ -9,35 +9,20 @@
 #include <string>
 #include <vector>
 
+#include "command_run.h"
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
 #include "temporary_folder.h"
-#include "tools/command_line.h"
 
 namespace omnister {
 namespace {
 
+using test::Outcome;
+using test::run;
+
 namespace fs = std::filesystem;
 using ::testing::HasSubstr;
-
-struct Outcome {
-  int code = -1;
-  std::string out, err;
-};
-
-Outcome run(std::vector<std::string> arguments) {
-  arguments.insert(arguments.begin(), "omnister");
-  std::vector<const char*> argv;
-  for (const std::string& argument : arguments) argv.push_back(argument.c_str());
-  ::testing::internal::CaptureStdout();
-  ::testing::internal::CaptureStderr();
-  Outcome outcome;
-  outcome.code = tools::runCommandLine(static_cast<int>(argv.size()), argv.data());
-  outcome.out = ::testing::internal::GetCapturedStdout();
-  outcome.err = ::testing::internal::GetCapturedStderr();
-  return outcome;
-}
 
 class RenderDewarp : public ::testing::Test {
  protected:

@@ -11,37 +11,22 @@
 #include <string>
 #include <vector>
 
+#include "command_run.h"
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/stereo/cloud.h"
-#include "tools/command_line.h"
 #include "unit/stereo/analytic_scene.h"
 
 namespace omnister {
 namespace {
 
+using test::Outcome;
+using test::run;
+
 namespace fs = std::filesystem;
 using ::testing::AllOf;
 using ::testing::HasSubstr;
-
-struct Outcome {
-  int code = -1;
-  std::string out, err;
-};
-
-Outcome run(std::vector<std::string> arguments) {
-  arguments.insert(arguments.begin(), "omnister");
-  std::vector<const char*> argv;
-  for (const std::string& argument : arguments) argv.push_back(argument.c_str());
-  ::testing::internal::CaptureStdout();
-  ::testing::internal::CaptureStderr();
-  Outcome outcome;
-  outcome.code = tools::runCommandLine(static_cast<int>(argv.size()), argv.data());
-  outcome.out = ::testing::internal::GetCapturedStdout();
-  outcome.err = ::testing::internal::GetCapturedStderr();
-  return outcome;
-}
 
 class StereoCommand : public ::testing::Test {
  protected:
