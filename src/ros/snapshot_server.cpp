@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/ros/snapshot_server.h"
 
-#include <message_filters/subscriber.h>
-#include <message_filters/time_synchronizer.h>
 #include <ros/callback_queue.h>
 #include <sensor_msgs/Image.h>
 #include <sensor_msgs/PointCloud2.h>
@@ -47,28 +45,26 @@ std::string SnapshotServer::save() const {
   ros::CallbackQueue queue;
   ros::NodeHandle node(node_);
   node.setCallbackQueue(&queue);
-  message_filters::Subscriber<sensor_msgs::PointCloud2> points(node, "points2", 2);
-  message_filters::Subscriber<sensor_msgs::Image> ranges(node, "range", 2);
-  message_filters::TimeSynchronizer<sensor_msgs::PointCloud2, sensor_msgs::Image> pairs(points,
-                                                                                        ranges, 4);
   sensor_msgs::PointCloud2ConstPtr cloud_message;
   sensor_msgs::ImageConstPtr range_message;
-  const auto take = [&](const sensor_msgs::PointCloud2ConstPtr& cloud,
-                        const sensor_msgs::ImageConstPtr& range) {
-    cloud_message = cloud;
-    range_message = range;
+  const ros::Subscriber points = node.subscribe<sensor_msgs::PointCloud2>(
+      "points2", 2,
+      [&](const sensor_msgs::PointCloud2ConstPtr& message) { cloud_message = message; });
+  const ros::Subscriber ranges = node.subscribe<sensor_msgs::Image>(
+      "range", 2, [&](const sensor_msgs::ImageConstPtr& message) { range_message = message; });
+  const auto paired = [&] {
+    return cloud_message && range_message &&
+           cloud_message->header.stamp == range_message->header.stamp;
   };
-  pairs.registerCallback(
-      boost::bind<void>(take, boost::placeholders::_1, boost::placeholders::_2));
   const ros::SteadyTime start = ros::SteadyTime::now();
-  while (ros::ok() && !cloud_message) {
-    queue.callAvailable(ros::WallDuration(0.05));
+  while (ros::ok() && !paired()) {
+    queue.callOne(ros::WallDuration(0.05));
     if ((ros::SteadyTime::now() - start).toSec() > timeout_)
       throw Error("no cloud with a range image on " + points.getTopic() + " and " +
                   ranges.getTopic() + " within " + std::to_string(static_cast<int>(timeout_)) +
                   " s");
   }
-  if (!cloud_message) throw Error("the node goes down");
+  if (!paired()) throw Error("the node goes down");
 
   const Cloud cloud = fromPointCloud(*cloud_message);
   checkImage(*range_message);

@@ -22,6 +22,10 @@ struct Arguments {
 
 void run(const Arguments& arguments) {
   const auto begin = std::chrono::steady_clock::now();
+  std::vector<std::string> inputs = arguments.images;
+  inputs.push_back(arguments.detections_file);
+  inputs.push_back(arguments.common.target_file);
+  checkOutputs(inputs, {arguments.out});
   const Detections detections =
       gatherDetections(arguments.common, arguments.images, arguments.detections_file, false);
   const CalibrationResult result = calibrate(detections, calibrationOptions(arguments.common));

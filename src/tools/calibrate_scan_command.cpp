@@ -72,6 +72,7 @@ const char* nameOf(SurfaceScale scale) {
 }
 
 void run(const Arguments& arguments, bool json) {
+  checkOutputs({arguments.board_detections}, {arguments.out});
   TargetFreeOptions options;
   options.structure.model = arguments.model;
   options.structure.even_terms = arguments.model == "asphere" ? arguments.even_terms : 0;

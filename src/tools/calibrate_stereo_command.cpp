@@ -48,6 +48,22 @@ void pairByName(Detections& left, Detections& right) {
 
 void run(const Arguments& arguments) {
   const auto begin = std::chrono::steady_clock::now();
+  // A rig file names lens files: without an own place they stand beside it.
+  std::string out_left = arguments.out_left;
+  std::string out_right = arguments.out_right;
+  if (!arguments.out_rig.empty()) {
+    const std::filesystem::path rig(arguments.out_rig);
+    const auto beside = [&](const char* side) {
+      return (rig.parent_path() / (rig.stem().string() + "_" + side + ".yaml")).string();
+    };
+    if (out_left.empty()) out_left = beside("left");
+    if (out_right.empty()) out_right = beside("right");
+  }
+  std::vector<std::string> inputs = arguments.left_images;
+  inputs.insert(inputs.end(), arguments.right_images.begin(), arguments.right_images.end());
+  inputs.insert(inputs.end(), {arguments.left_detections, arguments.right_detections,
+                               arguments.common.target_file});
+  checkOutputs(inputs, {out_left, out_right, arguments.out_rig});
   Detections left =
       gatherDetections(arguments.common, arguments.left_images, arguments.left_detections, true);
   Detections right =
@@ -78,17 +94,6 @@ void run(const Arguments& arguments) {
   json["pose"] = formatPose(result.T_left_right);
   json["warnings"] = result.warnings;
 
-  // A rig file names lens files: without an own place they stand beside it.
-  std::string out_left = arguments.out_left;
-  std::string out_right = arguments.out_right;
-  if (!arguments.out_rig.empty()) {
-    const std::filesystem::path rig(arguments.out_rig);
-    const auto beside = [&](const char* side) {
-      return (rig.parent_path() / (rig.stem().string() + "_" + side + ".yaml")).string();
-    };
-    if (out_left.empty()) out_left = beside("left");
-    if (out_right.empty()) out_right = beside("right");
-  }
   if (!arguments.common.report_folder.empty()) {
     const std::string& folder = arguments.common.report_folder;
     const std::string html_left = calibrationReport("Left camera", left, result.left);

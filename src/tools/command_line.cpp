@@ -7,6 +7,7 @@
 #include <csignal>
 #include <cstdio>
 #include <deque>
+#include <filesystem>
 #include <iostream>
 #include <memory>
 #include <opencv2/core/utils/logger.hpp>
@@ -34,18 +35,8 @@ void addTarget(CLI::App& app);
 namespace {
 
 constexpr AddCommand kCommands[] = {
-    addCalibrate,
-    addCalibrateScan,
-    addCalibrateStereo,
-    addImport,
-    addExport,
-    addProject,
-    addUnproject,
-    addStereo,
-    addEvaluate,
-    addRender,
-    addDewarp,
-    addTarget,
+    addCalibrate, addCalibrateScan, addCalibrateStereo, addImport, addExport, addProject,
+    addUnproject, addStereo,        addEvaluate,        addRender, addDewarp, addTarget,
     nullptr,
 };
 
@@ -58,7 +49,8 @@ std::string describe(const nlohmann::ordered_json& value) {
 bool& addJsonFlag(CLI::App& command) {
   static std::deque<bool> flags;
   bool& flag = flags.emplace_back(false);
-  command.add_flag("--json", flag, "Print one JSON object on standard output and nothing else there");
+  command.add_flag("--json", flag,
+                   "Print one JSON object on standard output and nothing else there");
   return flag;
 }
 
@@ -89,16 +81,52 @@ Progress consoleProgress() {
     if (stage != state->stage) {
       state->stage = stage;
       state->start = now;
-    } else if (fraction < 1.0 && now - state->last < std::chrono::milliseconds(terminal ? 200 : 2000)) {
+    } else if (fraction < 1.0 &&
+               now - state->last < std::chrono::milliseconds(terminal ? 200 : 2000)) {
       return;
     }
     state->last = now;
     const double elapsed = std::chrono::duration<double>(now - state->start).count();
     const double left = fraction > 0.0 ? elapsed * (1.0 - fraction) / fraction : 0.0;
-    std::fprintf(stderr, terminal ? "\r\033[K%s: %.0f %%, %.0f s left%s" : "%s: %.0f %%, %.0f s left%s",
+    std::fprintf(stderr,
+                 terminal ? "\r\033[K%s: %.0f %%, %.0f s left%s" : "%s: %.0f %%, %.0f s left%s",
                  stage.c_str(), 100.0 * fraction, left, !terminal || fraction >= 1.0 ? "\n" : "");
     std::fflush(stderr);
   };
+}
+
+namespace {
+
+bool sameFile(const std::filesystem::path& a, const std::filesystem::path& b) {
+  std::error_code ignored;
+  if (std::filesystem::equivalent(a, b, ignored)) return true;
+  return std::filesystem::weakly_canonical(a, ignored) ==
+         std::filesystem::weakly_canonical(b, ignored);
+}
+
+}  // namespace
+
+void checkOutputs(const std::vector<std::string>& inputs, const std::vector<std::string>& outputs) {
+  std::vector<std::string> others = inputs;
+  for (const std::string& output : outputs) {
+    if (output.empty()) continue;
+    for (std::size_t i = 0; i < others.size(); ++i) {
+      if (others[i].empty() || !sameFile(output, others[i])) continue;
+      throw InputError(output, "",
+                       i < inputs.size() ? "is an input and an output at once"
+                                         : "stands for two outputs, expected a file for each");
+    }
+    const std::filesystem::path folder = std::filesystem::path(output).parent_path();
+    std::error_code ignored;
+    if (!folder.empty() && !std::filesystem::is_directory(folder, ignored)) {
+      throw InputError(output, "",
+                       "cannot be written: there is no folder " + printable(folder.string()));
+    }
+    if (std::filesystem::is_directory(output, ignored)) {
+      throw InputError(output, "", "cannot be written: it is a folder");
+    }
+    others.push_back(output);
+  }
 }
 
 bool lexical_cast(const std::string& text, Size& size) {
@@ -107,7 +135,9 @@ bool lexical_cast(const std::string& text, Size& size) {
   const auto width = parseNumber(text.substr(0, cross));
   const auto height = parseNumber(text.substr(cross + 1));
   if (!width || !height) return false;
-  const auto whole = [](double value) { return value >= 1 && value <= 65535 && value == int(value); };
+  const auto whole = [](double value) {
+    return value >= 1 && value <= 65535 && value == int(value);
+  };
   if (!whole(*width) || !whole(*height)) return false;
   size = {static_cast<int>(*width), static_cast<int>(*height)};
   return true;

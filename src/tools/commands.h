@@ -1,29 +1,35 @@
 // SPDX-License-Identifier: Apache-2.0
-/// @file The subcommands. Each adds itself to the application with a callback that does the work and
-/// throws Error where a person can mend something.
+/// @file The subcommands. Each adds itself to the application with a callback that does the work
+/// and throws Error where a person can mend something.
 #pragma once
 
 #include <CLI/CLI.hpp>
 #include <nlohmann/json.hpp>
 #include <string>
+#include <vector>
 
 #include "omnister/common/progress.h"
 
 namespace omnister::tools {
 
-/// Adds `--json` to a subcommand. @return where the flag is stored; lives as long as the application
+/// Adds `--json` to a subcommand. @return where the flag is stored; lives as long as the
+/// application
 bool& addJsonFlag(CLI::App& command);
 
-/// The result of a subcommand: one JSON object on standard output with --json, else one "key: value"
-/// line each.
+/// The result of a subcommand: one JSON object on standard output with --json, else one "key:
+/// value" line each.
 void printResult(bool json, const nlohmann::ordered_json& result);
 
 /// A remark for a person, on standard error.
 void say(const std::string& message);
 
-/// Progress on standard error, at most a few lines a second, with percentage and time left; rewrites
-/// its line on a terminal.
+/// Progress on standard error, at most a few lines a second, with percentage and time left;
+/// rewrites its line on a terminal.
 Progress consoleProgress();
+
+/// To be called before any work: no output may be an input or another output (links followed), a
+/// folder, or lie in a folder that is not there. Empty names are passed over. @throws InputError
+void checkOutputs(const std::vector<std::string>& inputs, const std::vector<std::string>& outputs);
 
 /// "1280x960". @throws CLI::ValidationError (wrong usage)
 struct Size {

@@ -24,6 +24,7 @@ struct Arguments {
 
 void run(const Arguments& arguments, bool json) {
   checkImagePath(arguments.out);
+  checkOutputs({arguments.lens, arguments.in}, {arguments.out});
   const auto angles = parseNumbers(arguments.view);
   if (!angles || angles->size() != 3 || !cv::checkRange(*angles)) {
     throw InputError(

@@ -30,11 +30,8 @@ std::string round(double value, int digits) {
 }
 
 void run(const Options& options, bool json) {
+  checkOutputs({options.lens}, {options.out});
   const LensFile file = readLensFile(options.lens);
-  std::error_code not_there;
-  if (std::filesystem::equivalent(options.lens, options.out, not_there)) {
-    throw InputError(options.out, "", "is the lens file itself, expected another --out");
-  }
   LensExport made;
   try {
     made = exportLens(file, options.format, options.model);

@@ -44,6 +44,7 @@ std::string today() {
 }
 
 void run(const Options& options, bool json) {
+  checkOutputs({options.file}, {options.out});
   const std::string text = readFile(options.file, kMaxBytes);
   const ForeignCamera camera =
       readForeignCamera(text, options.file, options.format, options.camera);

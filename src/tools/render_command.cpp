@@ -23,6 +23,7 @@ struct Arguments {
 void run(const Arguments& arguments, bool json) {
   checkImagePath(arguments.out);
   if (!arguments.range.empty()) checkRangePath(arguments.range);
+  checkOutputs({arguments.lens, arguments.scene}, {arguments.out, arguments.range});
   const LensFile lens = readLensFile(arguments.lens);
   const sim::ScenePtr scene = sim::readScene(arguments.scene);
   const Pose T_world_camera = parsePose(arguments.pose, "--pose");

@@ -129,36 +129,13 @@ cv::Mat greyOf(const cv::Mat& image) {
   return grey;
 }
 
-bool sameFile(const fs::path& a, const fs::path& b) {
-  std::error_code ignored;
-  if (fs::equivalent(a, b, ignored)) return true;
-  return fs::weakly_canonical(a, ignored) == fs::weakly_canonical(b, ignored);
-}
-
-void checkOutputs(const StereoArguments& arguments) {
+void checkFiles(const StereoArguments& arguments) {
   if (!arguments.cloud.empty()) checkCloudPath(arguments.cloud);
   if (!arguments.range.empty()) checkRangePath(arguments.range);
-  std::vector<std::string> others = {arguments.lens, arguments.reference, arguments.mask};
-  others.insert(others.end(), arguments.lens_displaced.begin(), arguments.lens_displaced.end());
-  others.insert(others.end(), arguments.displaced.begin(), arguments.displaced.end());
-  for (const std::string& output : {arguments.cloud, arguments.range}) {
-    if (output.empty()) continue;
-    for (const std::string& other : others) {
-      if (!other.empty() && sameFile(output, other)) {
-        throw InputError(output, "", "is an input and an output at once");
-      }
-    }
-    const fs::path folder = fs::path(output).parent_path();
-    std::error_code ignored;
-    if (!folder.empty() && !fs::is_directory(folder, ignored)) {
-      throw InputError(output, "",
-                       "cannot be written: there is no folder " + printable(folder.string()));
-    }
-    if (fs::is_directory(output, ignored)) {
-      throw InputError(output, "", "cannot be written: it is a folder");
-    }
-    others.push_back(output);
-  }
+  std::vector<std::string> inputs = {arguments.lens, arguments.reference, arguments.mask};
+  inputs.insert(inputs.end(), arguments.lens_displaced.begin(), arguments.lens_displaced.end());
+  inputs.insert(inputs.end(), arguments.displaced.begin(), arguments.displaced.end());
+  checkOutputs(inputs, {arguments.cloud, arguments.range});
 }
 
 struct Inputs {
@@ -245,7 +222,7 @@ void runStereo(StereoArguments& arguments, bool json) {
   if (arguments.repeat < 1 || arguments.repeat > 100000) {
     throw Error("--repeat is " + std::to_string(arguments.repeat) + ", expected 1 to 100000");
   }
-  checkOutputs(arguments);
+  checkFiles(arguments);
   cv::setNumThreads(threadCount(std::clamp(arguments.options.threads, 0, kMaxThreads)));
 
   auto start = Clock::now();

@@ -81,6 +81,17 @@ TEST_F(CalibrateCommand, TouchesNothingWhenItFails) {
   EXPECT_EQ(out_, "");
   EXPECT_EQ(readFile(lens), "precious");
   EXPECT_FALSE(std::filesystem::exists(folder_ / "report"));
+  const std::string corners = folder_ / "corners.csv";
+  const std::string before = readFile(corners);
+  EXPECT_EQ(run({"calibrate", "--detections", corners, "--size", "1280x960", "--out", corners}), 1);
+  EXPECT_THAT(err_, HasSubstr("an input and an output"));
+  EXPECT_EQ(readFile(corners), before);
+  EXPECT_EQ(
+      run({"calibrate-stereo", "--left-detections", corners, "--right-detections", corners,
+           "--size", "1280x960", "--out-left", lens, "--out-right", folder_ / "no" / "b.yaml"}),
+      1);
+  EXPECT_THAT(err_, HasSubstr("there is no folder"));
+  EXPECT_EQ(readFile(lens), "precious");
   EXPECT_EQ(run({"calibrate", "--detections", folder_ / "absent.csv", "--size", "1280x960"}), 1);
   EXPECT_THAT(err_, HasSubstr("absent.csv"));
   EXPECT_EQ(run({"calibrate", "--detections", folder_ / "corners.csv"}), 2);

@@ -301,7 +301,9 @@ TEST_F(LensCommands, RefusalsLeaveNoFile) {
   }
   EXPECT_THAT(refusal({"export", lens, "--format", "ocam", "--out", path("no/new.txt")}),
               HasSubstr("no/new.txt"));
-  EXPECT_THAT(refusal({"export", lens, "--format", "ocam", "--out", lens}), HasSubstr("--out"));
+  EXPECT_THAT(refusal({"export", lens, "--format", "ocam", "--out", lens}),
+              HasSubstr("input and an output"));
+  EXPECT_THAT(refusal({"import", chain, "--out", chain}), HasSubstr("input and an output"));
   EXPECT_EQ(readFile(lens), lens_text);
   EXPECT_THAT(refusal({"project", "--lens", path("none.yaml")}), HasSubstr("none.yaml"));
   EXPECT_THAT(refusal({"unproject", "--lens", chain}), HasSubstr("lens_surface"));
