@@ -249,6 +249,8 @@ void StereoPipeline::onLens(const LensModelMessage::ConstPtr& message, std::size
     const std::string model(file.lens->model());
     {
       std::lock_guard<std::mutex> lock(mutex_);
+      // A later one may have come while this was read by another thread.
+      if (eyes_[eye].lens && message->header.stamp < eyes_[eye].lens_stamp) return;
       eyes_[eye].lens = std::move(file);
       eyes_[eye].lens_text = message->yaml;
       eyes_[eye].lens_stamp = message->header.stamp;
