@@ -23,7 +23,10 @@ namespace {
 constexpr std::size_t kMatchersKept = 4;
 /// Poses nearer than this share of the baseline have the same matcher: far below a pixel.
 constexpr double kSamePlace = 2e-4;
-constexpr double kSameAngle = 1e-4;      // [rad]
+constexpr double kSameAngle = 1e-4;  // [rad]
+/// Lenses that may wait to be read: in a shorter queue an older one that comes later pushes out the
+/// one that counts.
+constexpr std::uint32_t kLensesWaiting = 16;
 constexpr double kWarningPeriod = 5.0;   // [s]
 constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said why
 
@@ -134,7 +137,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
     for (std::size_t i = 0; i < eyes_.size(); ++i) {
       if (eyes_[i].lens_from_file) continue;
       lens_subscribers_.push_back(node_.subscribe<LensModelMessage>(
-          prefixes[i] + "lens_model", 2,
+          prefixes[i] + "lens_model", kLensesWaiting,
           [this, i](const LensModelMessage::ConstPtr& message) { onLens(message, i); }));
     }
   }
