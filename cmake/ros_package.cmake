@@ -1,6 +1,6 @@
 # The catkin side of the package: messages, exports, install destinations.
 set(OMNISTER_CATKIN_COMPONENTS
-  actionlib actionlib_msgs cv_bridge diagnostic_updater geometry_msgs
+  actionlib actionlib_msgs cv_bridge diagnostic_updater dynamic_reconfigure geometry_msgs
   image_transport message_filters message_generation nodelet pluginlib rosbag rosbag_storage roscpp
   sensor_msgs std_msgs std_srvs tf2 tf2_ros visualization_msgs)
 find_package(catkin REQUIRED COMPONENTS ${OMNISTER_CATKIN_COMPONENTS})
@@ -14,12 +14,14 @@ if(OMNISTER_SRV_FILES)
 endif()
 add_action_files(DIRECTORY action FILES ${OMNISTER_ACTION_FILES})
 generate_messages(DEPENDENCIES actionlib_msgs geometry_msgs sensor_msgs std_msgs)
+file(GLOB OMNISTER_CFG_FILES CONFIGURE_DEPENDS RELATIVE ${PROJECT_SOURCE_DIR} cfg/*.cfg)
+generate_dynamic_reconfigure_options(${OMNISTER_CFG_FILES})
 
 catkin_package(
   INCLUDE_DIRS include
   LIBRARIES omnister_core omnister_device
-  CATKIN_DEPENDS actionlib actionlib_msgs cv_bridge geometry_msgs image_transport message_runtime
-    nodelet roscpp sensor_msgs std_msgs std_srvs tf2_ros visualization_msgs)
+  CATKIN_DEPENDS actionlib actionlib_msgs cv_bridge dynamic_reconfigure geometry_msgs image_transport
+    message_runtime nodelet roscpp sensor_msgs std_msgs std_srvs tf2_ros visualization_msgs)
 
 set(OMNISTER_BIN_DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})
 set(OMNISTER_LIB_DESTINATION ${CATKIN_PACKAGE_LIB_DESTINATION})

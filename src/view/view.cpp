@@ -4,6 +4,7 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <opencv2/imgproc.hpp>
 #include <string>
 
@@ -260,6 +261,51 @@ cv::Mat View::render(const cv::Mat& image) const {
   }
   view.setTo(cv::Scalar::all(0), mask_ == 0);
   return view;
+}
+
+DepthView::DepthView(const LensModel& lens, cv::Size lens_size, const ViewGeometry& geometry,
+                     int threads)
+    : lens_size_(lens_size) {
+  checkSize(geometry.size, "view");
+  checkSize(lens_size, "camera image");
+  const cv::Size size = geometry.size;
+  nearest_.create(size, CV_16SC2);
+  if (geometry.projection == Projection::kPinhole) cosine_.create(size, CV_32FC1);
+  const Eigen::Vector3d axis = geometry.rotation.col(2);
+  parallelFor(
+      0, static_cast<std::size_t>(size.height), threads,
+      [&](std::size_t row) {
+        const int y = static_cast<int>(row);
+        for (int x = 0; x < size.width; ++x) {
+          const auto ray = viewRay(geometry, Eigen::Vector2d(x, y));
+          const auto pixel = ray ? lens.project(*ray) : std::nullopt;
+          const cv::Point at =
+              pixel && pixel->allFinite() && pixel->cwiseAbs().maxCoeff() < kMostSide
+                  ? cv::Point(static_cast<int>(std::lround(pixel->x())),
+                              static_cast<int>(std::lround(pixel->y())))
+                  : cv::Point(-1, -1);
+          const bool seen = cv::Rect({0, 0}, lens_size).contains(at);
+          nearest_.at<cv::Vec2s>(y, x) =
+              seen ? cv::Vec2s(static_cast<short>(at.x), static_cast<short>(at.y))
+                   : cv::Vec2s(-1, -1);
+          if (!cosine_.empty())
+            cosine_.at<float>(y, x) = ray ? static_cast<float>(ray->dot(axis)) : 0.0f;
+        }
+      },
+      8);
+}
+
+cv::Mat DepthView::render(const cv::Mat& range) const {
+  if (range.size() != lens_size_ || range.type() != CV_32FC1) {
+    throw Error("range image is " + std::to_string(range.cols) + "x" + std::to_string(range.rows) +
+                ", expected 32-bit floats of the lens' " + std::to_string(lens_size_.width) + "x" +
+                std::to_string(lens_size_.height));
+  }
+  cv::Mat depth;
+  cv::remap(range, depth, nearest_, cv::noArray(), cv::INTER_NEAREST, cv::BORDER_CONSTANT,
+            cv::Scalar::all(std::numeric_limits<double>::quiet_NaN()));
+  if (!cosine_.empty()) cv::multiply(depth, cosine_, depth);
+  return depth;
 }
 
 }  // namespace omnister

@@ -106,6 +106,22 @@ TEST(CalibrationNodelet, IsLoadedAndUnloaded) {
   }
 }
 
+TEST(ViewNodelet, IsLoadedAndUnloadedWhileSomebodyListens) {
+  const std::string name = "/come_and_go/view_node";
+  nodelet::Loader loader(false);
+  Collector<sensor_msgs::Image> views(ros::NodeHandle("/come_and_go"), "view/image_raw");
+  for (int round = 0; round < 8; ++round) {
+    ASSERT_TRUE(loader.load(name, "omnister/ViewNodelet", {}, {}));
+    if (round % 2 == 0) {
+      ASSERT_TRUE(eventually([&] { return views.connected(); })) << round;
+    }
+    ASSERT_TRUE(loader.unload(name));
+    ASSERT_TRUE(eventually([&] { return !views.connected(); })) << round;
+  }
+  ros::NodeHandle(name).setParam("hfov", -1.0);
+  EXPECT_FALSE(loader.load(name, "omnister/ViewNodelet", {}, {}));
+}
+
 TEST(CameraNodelet, DoesNotStartWithBadParameters) {
   const std::string name = "/bad/camera";
   ros::NodeHandle(name).setParam("frame_rate", -5.0);

@@ -93,4 +93,24 @@ class View {
   std::vector<Level> levels_;
 };
 
+/// The range image of a camera as depth in a view of it. Ranges are taken from the nearest pixel and
+/// never mixed: between a near and a far one there is nothing.
+class DepthView {
+ public:
+  /// As View.
+  DepthView(const LensModel& lens, cv::Size lens_size, const ViewGeometry& geometry,
+            int threads = 0);
+
+  /// @param range CV_32FC1 of the lens' size, along the ray [m]
+  /// @return CV_32FC1 of the view's size: along the axis of a pinhole view, along the ray for the
+  ///         other projections [m]; NaN where nothing is known
+  /// @throws Error for another size or type
+  cv::Mat render(const cv::Mat& range) const;
+
+ private:
+  cv::Size lens_size_;
+  cv::Mat nearest_;  // CV_16SC2, the camera's pixel; -1 where it sees nothing
+  cv::Mat cosine_;   // CV_32FC1, of the ray and the axis; empty: 1
+};
+
 }  // namespace omnister

@@ -212,5 +212,28 @@ TEST(View, RefusesWhatMakesNoSense) {
   EXPECT_THROW(view.render(cv::Mat::zeros(200, 200, CV_64FC1)), Error);
 }
 
+TEST(DepthView, OfASphereIsTheCosineAndThePanoramasTheRange) {
+  const EquidistantLens lens({199.5, 149.5}, 110.0, 95 * kDegree);
+  const cv::Mat range(300, 400, CV_32FC1, cv::Scalar(3.0));
+  const ViewGeometry pinhole =
+      makeViewGeometry(Projection::kPinhole, {160, 120}, 80 * kDegree, viewRotation(0.4, 0.1, 0.2));
+  const cv::Mat depth = DepthView(lens, {400, 300}, pinhole).render(range);
+  int compared = 0;
+  for (int y = 0; y < depth.rows; ++y)
+    for (int x = 0; x < depth.cols; ++x) {
+      const Eigen::Vector3d at((x - 79.5) / pinhole.focal_px, (y - 59.5) / pinhole.focal_px, 1.0);
+      ASSERT_NEAR(depth.at<float>(y, x), 3.0 / at.norm(), 1e-5);
+      ++compared;
+    }
+  EXPECT_EQ(compared, 160 * 120);
+  const cv::Mat panorama = DepthView(lens, {400, 300},
+                                     makeViewGeometry(Projection::kEquirectangular, {180, 90},
+                                                      2 * M_PI, Eigen::Matrix3d::Identity()))
+                               .render(range);
+  EXPECT_EQ(panorama.at<float>(45, 90), 3.0F);
+  EXPECT_TRUE(std::isnan(panorama.at<float>(45, 0))) << "behind the camera";
+  EXPECT_THROW(DepthView(lens, {400, 300}, pinhole).render(range.t()), Error);
+}
+
 }  // namespace
 }  // namespace omnister

@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <ros/ros.h>
+
+#include "omnister/ros/view_server.h"
+
+int main(int argc, char** argv) {
+  ros::init(argc, argv, "view");
+  try {
+    omnister::ViewServer view{ros::NodeHandle(), ros::NodeHandle("~")};
+    ros::spin();
+  } catch (const std::exception& error) {
+    ROS_FATAL("%s", error.what());
+    return 1;
+  }
+  return 0;
+}
