@@ -33,7 +33,9 @@ std::string degrees(double radians) {
 
 }  // namespace
 
-FramePairing::FramePairing(const PairingOptions& options) : options_(options) {
+FramePairing::FramePairing(const PairingOptions& options) { setOptions(options); }
+
+void FramePairing::setOptions(const PairingOptions& options) {
   if (!(options.min_baseline > 0.0))
     throw Error("min_baseline is " + metres(options.min_baseline) + ", expected more than 0");
   if (!(options.max_baseline > options.min_baseline))
@@ -44,6 +46,7 @@ FramePairing::FramePairing(const PairingOptions& options) : options_(options) {
   if (options.history < static_cast<std::size_t>(options.positions) || options.max_waiting < 1)
     throw Error("history is " + std::to_string(options.history) +
                 ", expected at least positions, " + std::to_string(options.positions));
+  options_ = options;
 }
 
 void FramePairing::drop(const std::string& name, const std::string& reason) {

@@ -1,7 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/ros/stereo_pipeline.h"
 
+#include <omnister/StageTimes.h>
 #include <sensor_msgs/PointCloud2.h>
+#include <sensor_msgs/image_encodings.h>
+#include <visualization_msgs/MarkerArray.h>
 
 #include <algorithm>
 #include <chrono>
@@ -13,8 +16,10 @@
 #include "omnister/common/image_file.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
+#include "omnister/ros/lens_markers.h"
 #include "omnister/ros/stereo_messages.h"
 #include "omnister/stereo/cloud.h"
+#include "omnister/view/epipolar_overlay.h"
 
 namespace omnister {
 namespace {
@@ -27,6 +32,7 @@ constexpr double kSameAngle = 1e-4;  // [rad]
 /// Lenses that may wait to be read: in a shorter queue an older one that comes later pushes out the
 /// one that counts.
 constexpr std::uint32_t kLensesWaiting = 16;
+constexpr std::size_t kMostClicked = 8;  // pixels of the overlay; the oldest go first
 constexpr double kWarningPeriod = 5.0;   // [s]
 constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said why
 
@@ -51,6 +57,68 @@ bool sameGeometry(const StereoGeometry& a, const StereoGeometry& b) {
   return true;
 }
 
+/// Frames that may be needed to find `positions` places.
+std::size_t historyFor(int positions) { return static_cast<std::size_t>(positions) + 7; }
+
+void applyPreset(StereoConfig& config) {
+  if (config.preset == "custom") return;
+  config.matcher = "sweep";
+  config.positions = config.preset == "accurate" ? 4 : 1;
+  config.hypotheses = 0;
+}
+
+StereoConfig toConfig(const StereoParameters& parameters) {
+  StereoConfig config = StereoConfig::__getDefault__();
+  config.preset = parameters.preset;
+  config.min_baseline = parameters.pairing.min_baseline;
+  config.max_baseline = parameters.pairing.max_baseline;
+  config.positions = parameters.pairing.positions;
+  config.min_range = parameters.matching.min_range;
+  config.max_range = parameters.matching.max_range;
+  config.hypotheses = parameters.matching.hypotheses;
+  config.matcher = parameters.matcher;
+  config.max_rate = parameters.min_period > 0.0 ? 1.0 / parameters.min_period : 0.0;
+  config.epipolar_pixels = parameters.epipolar_pixels;
+  return config;
+}
+
+void take(const StereoConfig& config, StereoParameters& parameters) {
+  parameters.preset = config.preset;
+  parameters.pairing.min_baseline = config.min_baseline;
+  parameters.pairing.max_baseline = config.max_baseline;
+  parameters.pairing.positions = config.positions;
+  parameters.pairing.history = historyFor(config.positions);
+  parameters.matching.min_range = config.min_range;
+  parameters.matching.max_range = config.max_range;
+  parameters.matching.hypotheses = config.hypotheses;
+  parameters.matcher = config.matcher;
+  parameters.min_period = config.max_rate > 0.0 ? 1.0 / config.max_rate : 0.0;
+  parameters.epipolar_pixels = config.epipolar_pixels;
+}
+
+/// The test that rejected most pixels.
+std::string mostRejecting(const MatchStatistics& statistics) {
+  const auto most =
+      std::max_element(statistics.rejected.begin(), statistics.rejected.end(),
+                       [](const auto& a, const auto& b) { return a.second < b.second; });
+  return most == statistics.rejected.end() ? "none" : most->first;
+}
+
+/// Lap times by name.
+class Laps {
+ public:
+  void lap(const std::string& name) {
+    const ros::SteadyTime now = ros::SteadyTime::now();
+    seconds_[name] += (now - last_).toSec();
+    last_ = now;
+  }
+  std::map<std::string, double>& seconds() { return seconds_; }
+
+ private:
+  ros::SteadyTime last_ = ros::SteadyTime::now();
+  std::map<std::string, double> seconds_;
+};
+
 std::int64_t nowNanoseconds() { return static_cast<std::int64_t>(ros::Time::now().toNSec()); }
 
 }  // namespace
@@ -73,7 +141,6 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   pairing.settle_distance = parameters.number("settle_distance", 2e-4, 0.0, 1.0, "m");
   pairing.max_wait = parameters.number("max_wait", 1.0, 0.0, 60.0, "s");
   pairing.max_age = parameters.number("max_age", 0.0, 0.0, 1e6, "s");
-  pairing.history = static_cast<std::size_t>(pairing.positions) + 7;
 
   result.max_skew = parameters.number("max_skew", 0.02, 0.0, 1.0, "s");
   // rviz and others fail on huge coordinates, so a cloud always ends somewhere.
@@ -84,6 +151,12 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   const double rate = parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)");
   result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
   result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
+  result.preset = parameters.choice("preset", "custom", {"custom", "balanced", "accurate"});
+  result.epipolar_pixels = parameters.text("epipolar_pixels", "");
+  parsePixels(result.epipolar_pixels, "~epipolar_pixels");
+  StereoConfig config = toConfig(result);
+  applyPreset(config);
+  take(config, result);
   if (result.matching.max_range <= result.matching.min_range)
     throw InputError("~max_range", "", "is not larger than ~min_range");
   parameters.warnUnknown();
@@ -104,6 +177,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       node_(node),
       transport_(node_),
       eyes_(parameters_.rig ? 2 : 1),
+      live_(parameters_),
       pairing_(parameters_.pairing),
       last_cloud_(ros::SteadyTime::now()),
       diagnostics_(node, private_node) {
@@ -125,6 +199,13 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
     }
   }
   tf_listener_ = std::make_unique<tf2_ros::TransformListener>(tf_buffer_);
+  // Reads the same parameters, which are known to be good by now.
+  config_server_ =
+      std::make_unique<dynamic_reconfigure::Server<StereoConfig>>(config_mutex_, private_node);
+  config_server_->updateConfig(toConfig(parameters_));
+  config_server_->setCallback([this](StereoConfig& config, std::uint32_t) { configure(config); });
+  lens_publisher_ = node_.advertise<visualization_msgs::MarkerArray>("lens_surface", 1, true);
+  times_publisher_ = node_.advertise<StageTimes>("timing", 10);
 
   {
     std::lock_guard<std::mutex> lock(connection_mutex_);
@@ -134,6 +215,10 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
     points_publisher_ = node_.advertise<sensor_msgs::PointCloud2>("points2", 1, changed, changed);
     depth_publisher_ = node_.advertise<sensor_msgs::Image>("depth", 1, changed, changed);
     range_publisher_ = node_.advertise<sensor_msgs::Image>("range", 1, changed, changed);
+    epipolar_publisher_ = node_.advertise<sensor_msgs::Image>("epipolar", 1, changed, changed);
+    click_subscribers_ = {
+        node_.subscribe("clicked_point", 4, &StereoPipeline::onClickedPoint, this),
+        node_.subscribe("epipolar_mouse_left", 4, &StereoPipeline::onClickedPixel, this)};
     for (std::size_t i = 0; i < eyes_.size(); ++i) {
       if (eyes_[i].lens_from_file) continue;
       lens_subscribers_.push_back(node_.subscribe<LensModelMessage>(
@@ -151,6 +236,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
 }
 
 StereoPipeline::~StereoPipeline() {
+  config_server_.reset();
   diagnostics_timer_.stop();
   {
     std::lock_guard<std::mutex> lock(mutex_);
@@ -161,15 +247,107 @@ StereoPipeline::~StereoPipeline() {
   points_publisher_.shutdown();
   depth_publisher_.shutdown();
   range_publisher_.shutdown();
+  epipolar_publisher_.shutdown();
   for (ros::Subscriber& subscriber : lens_subscribers_) subscriber.shutdown();
+  for (ros::Subscriber& subscriber : click_subscribers_) subscriber.shutdown();
   std::lock_guard<std::mutex> lock(connection_mutex_);
   unsubscribe();
+}
+
+void StereoPipeline::configure(StereoConfig& config) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  const StereoConfig before = toConfig(live_);
+  // Whoever asks is told what became of it: what contradicts itself stays as it was.
+  if (!(config.min_baseline < config.max_baseline)) {
+    ROS_WARN("min_baseline %g m is not below max_baseline %g m: both stay", config.min_baseline,
+             config.max_baseline);
+    config.min_baseline = before.min_baseline;
+    config.max_baseline = before.max_baseline;
+  }
+  if (!(config.min_range < config.max_range)) {
+    ROS_WARN("min_range %g m is not below max_range %g m: both stay", config.min_range,
+             config.max_range);
+    config.min_range = before.min_range;
+    config.max_range = before.max_range;
+  }
+  try {
+    parsePixels(config.epipolar_pixels, "epipolar_pixels");
+    if (config.epipolar_pixels != before.epipolar_pixels) clicked_.clear();
+  } catch (const Error& error) {
+    ROS_WARN("%s", error.what());
+    config.epipolar_pixels = before.epipolar_pixels;
+  }
+  const auto known = [](const std::string& value, std::initializer_list<const char*> choices) {
+    return std::find(choices.begin(), choices.end(), value) != choices.end();
+  };
+  if (!known(config.matcher, {"sweep", "thesis"})) config.matcher = before.matcher;
+  if (!known(config.preset, {"custom", "balanced", "accurate"}))
+    config.preset = before.preset;
+  StereoConfig preset = config;
+  applyPreset(preset);
+  if (config.preset != before.preset)
+    config = preset;
+  else if (preset.positions != config.positions || preset.hypotheses != config.hypotheses ||
+           preset.matcher != config.matcher)
+    config.preset = "custom";
+  take(config, live_);
+  ++generation_;
+  pairing_.setOptions(live_.pairing);
+}
+
+void StereoPipeline::pick(const Eigen::Vector2d& pixel) {
+  clicked_.emplace_back(pixel.x(), pixel.y());
+  if (clicked_.size() > kMostClicked) clicked_.erase(clicked_.begin());
+}
+
+void StereoPipeline::onClickedPoint(const geometry_msgs::PointStamped& point) {
+  try {
+    std::string frame_id;
+    LensPtr lens;
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      frame_id = reference_frame_;
+      if (eyes_[0].lens) lens = eyes_[0].lens->lens;
+    }
+    if (frame_id.empty() || !lens) throw Error("there is no image or no lens yet");
+    const Pose T_camera_point = fromTransform(
+        tf_buffer_.lookupTransform(frame_id, point.header.frame_id, ros::Time(0)).transform, "tf");
+    const Eigen::Vector3d at =
+        T_camera_point * Eigen::Vector3d(point.point.x, point.point.y, point.point.z);
+    const auto pixel = lens->project(at);
+    if (!pixel) throw Error("the camera does not see it");
+    std::lock_guard<std::mutex> lock(mutex_);
+    pick(*pixel);
+  } catch (const std::exception& error) {
+    ROS_WARN("clicked point: %s", printable(error.what(), 300).c_str());
+  }
+}
+
+void StereoPipeline::onClickedPixel(const geometry_msgs::Point& pixel) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  // The left half of the overlay is the reference image.
+  const bool inside = eyes_[0].lens && pixel.x >= 0.0 && pixel.y >= 0.0 &&
+                      pixel.x < eyes_[0].lens->image_size.width &&
+                      pixel.y < eyes_[0].lens->image_size.height;
+  if (inside) pick({pixel.x, pixel.y});
+}
+
+void StereoPipeline::publishLens(const std::string& frame_id) {
+  LensFile file;
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (!eyes_[0].lens || frame_id.empty() || lens_frame_ == frame_id) return;
+    lens_frame_ = frame_id;
+    file = *eyes_[0].lens;
+  }
+  lens_publisher_.publish(lensMarkers(file, frame_id));
 }
 
 void StereoPipeline::onConnection() {
   std::lock_guard<std::mutex> lock(connection_mutex_);
   const bool wanted = points_publisher_.getNumSubscribers() + depth_publisher_.getNumSubscribers() +
-                          range_publisher_.getNumSubscribers() >
+                          range_publisher_.getNumSubscribers() +
+                          epipolar_publisher_.getNumSubscribers() >
                       0;
   try {
     if (wanted && !subscribed_) subscribe();
@@ -257,7 +435,9 @@ void StereoPipeline::onLens(const LensModelMessage::ConstPtr& message, std::size
       eyes_[eye].lens = std::move(file);
       eyes_[eye].lens_text = message->yaml;
       eyes_[eye].lens_stamp = message->header.stamp;
+      if (eye == 0) lens_frame_.clear();
     }
+    if (eye == 0) publishLens(message->header.frame_id);
     ROS_INFO("new lens on %s: %s, %ux%u", topic.c_str(), model.c_str(), message->width,
              message->height);
   } catch (const std::exception& error) {
@@ -355,7 +535,7 @@ PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t 
 std::optional<StereoPipeline::Job> StereoPipeline::nextJob() {
   std::unique_lock<std::mutex> lock(mutex_);
   const auto due_in = [&] {
-    return parameters_.min_period - (ros::SteadyTime::now() - last_start_).toSec();
+    return live_.min_period - (ros::SteadyTime::now() - last_start_).toSec();
   };
   if (!stopping_ && !(pending_ && due_in() <= 0.0)) {
     double pause = pairing_.waiting() ? 0.01 : 0.2;
@@ -421,7 +601,9 @@ void StereoPipeline::run() {
   }
 }
 
-Matcher& StereoPipeline::matcherFor(const StereoGeometry& geometry) {
+Matcher& StereoPipeline::matcherFor(const StereoGeometry& geometry, const StereoParameters& live,
+                                    std::size_t generation) {
+  matchers_.remove_if([&](const CachedMatcher& kept) { return kept.generation != generation; });
   const auto known = std::find_if(
       matchers_.begin(), matchers_.end(),
       [&](const CachedMatcher& kept) { return sameGeometry(kept.geometry, geometry); });
@@ -429,10 +611,28 @@ Matcher& StereoPipeline::matcherFor(const StereoGeometry& geometry) {
     matchers_.splice(matchers_.begin(), matchers_, known);
   } else {
     matchers_.push_front(
-        {geometry, makeMatcher(parameters_.matcher, geometry, parameters_.matching)});
+        {generation, geometry, makeMatcher(live.matcher, geometry, live.matching)});
     if (matchers_.size() > kMatchersKept) matchers_.pop_back();
   }
   return *matchers_.front().matcher;
+}
+
+void StereoPipeline::publishOverlay(const Job& job, const StereoGeometry& geometry,
+                                    const StereoParameters& live, const MatchResult& result,
+                                    int bits) {
+  std::vector<cv::Point2d> pixels;
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    pixels = clicked_;
+  }
+  if (pixels.empty()) pixels = parsePixels(live.epipolar_pixels, "epipolar_pixels");
+  if (pixels.empty()) pixels = defaultPixels(geometry.reference_size);
+  const cv::Mat picture =
+      drawEpipolarOverlay(toBgr(*job.reference, bits), toBgr(*job.displaced.front(), bits),
+                          geometry, live.matching, result, pixels);
+  const sensor_msgs::ImagePtr message = toImage(picture, sensor_msgs::image_encodings::BGR8);
+  message->header = job.reference->header;
+  epipolar_publisher_.publish(message);
 }
 
 const cv::Mat& StereoPipeline::raysOf(const LensFile& file) {
@@ -445,10 +645,16 @@ const cv::Mat& StereoPipeline::raysOf(const LensFile& file) {
 
 void StereoPipeline::process(const Job& job) {
   const ros::SteadyTime start = ros::SteadyTime::now();
+  Laps laps;
   std::vector<LensFile> lenses;
+  StereoParameters live;
+  std::size_t generation = 0;
   {
     std::lock_guard<std::mutex> lock(mutex_);
     last_start_ = start;
+    live = live_;
+    generation = generation_;
+    reference_frame_ = job.reference->header.frame_id;
     for (const Eye& eye : eyes_)
       if (eye.lens) lenses.push_back(*eye.lens);
   }
@@ -460,7 +666,8 @@ void StereoPipeline::process(const Job& job) {
   checkFrame(*job.reference, reference_lens.image_size, eyes_.front().topic);
   for (const auto& image : job.displaced)
     checkFrame(*image, displaced_lens.image_size, eyes_.back().topic);
-  const cv::Mat& mask = parameters_.matching.mask;
+  publishLens(job.reference->header.frame_id);
+  const cv::Mat& mask = live.matching.mask;
   if (!mask.empty() && mask.size() != reference_lens.image_size)
     throw InputError("~mask", "size", "is not that of the lens' image");
 
@@ -476,25 +683,47 @@ void StereoPipeline::process(const Job& job) {
   std::vector<cv::Mat> displaced;
   for (const auto& image : job.displaced) displaced.push_back(toGray(*image, bits));
 
-  const MatchResult result = matcherFor(geometry).match(reference, displaced);
+  laps.lap("convert");
+  Matcher& matcher = matcherFor(geometry, live, generation);
+  laps.lap("prepare");
+  const MatchResult result = matcher.match(reference, displaced);
+  laps.lap("match");
 
   const std_msgs::Header& header = job.reference->header;
   const bool points_wanted = points_publisher_.getNumSubscribers() > 0;
   if (points_wanted || depth_publisher_.getNumSubscribers() > 0) {
-    const Cloud cloud = makeCloud(result, raysOf(reference_lens),
-                                  points_wanted ? toBgr(*job.reference, bits) : reference,
-                                  parameters_.matching.threads);
+    const Cloud cloud =
+        makeCloud(result, raysOf(reference_lens),
+                  points_wanted ? toBgr(*job.reference, bits) : reference, live.matching.threads);
     if (points_wanted) points_publisher_.publish(toPointCloud(cloud, header));
     if (depth_publisher_.getNumSubscribers() > 0) depth_publisher_.publish(toDepth(cloud, header));
   }
   if (range_publisher_.getNumSubscribers() > 0)
     range_publisher_.publish(toRange(result.range, header));
 
+  laps.lap("publish");
+  if (epipolar_publisher_.getNumSubscribers() > 0) {
+    publishOverlay(job, geometry, live, result, bits);
+    laps.lap("overlay");
+  }
+
+  StageTimes times;
+  times.header = header;
+  laps.seconds()["total"] = (ros::SteadyTime::now() - start).toSec();
+  for (const auto& [stage, seconds] : result.statistics.seconds)
+    if (stage != "total") laps.seconds()["match " + stage] = seconds;
+  for (const auto& [stage, seconds] : laps.seconds()) {
+    times.stages.push_back(stage);
+    times.seconds.push_back(seconds);
+  }
+  times.age = (ros::Time::now() - header.stamp).toSec();
+  times_publisher_.publish(times);
+
   std::lock_guard<std::mutex> lock(mutex_);
   ++clouds_;
   last_cloud_ = ros::SteadyTime::now();
   last_statistics_ = result.statistics;
-  last_seconds_ = (last_cloud_ - start).toSec();
+  last_statistics_.seconds = laps.seconds();
   reason_.clear();
 }
 
@@ -509,6 +738,10 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
   using diagnostic_msgs::DiagnosticStatus;
   if (!subscribed)
     status.summary(DiagnosticStatus::OK, "idle: nobody listens");
+  else if (silence < kWarningPeriod && clouds_ > 0 && last_statistics_.valid == 0)
+    status.summary(DiagnosticStatus::WARN,
+                   "clouds are empty: every pixel is rejected, most by the test '" +
+                       mostRejecting(last_statistics_) + "'");
   else if (silence < kWarningPeriod)
     status.summary(DiagnosticStatus::OK, "running");
   else
@@ -518,7 +751,6 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
   status.add("clouds", clouds_);
   if (clouds_ > 0) {
     status.add("valid pixels", last_statistics_.valid);
-    status.add("seconds, whole frame", last_seconds_);
     for (const auto& [stage, seconds] : last_statistics_.seconds)
       status.add("seconds, " + stage, seconds);
     for (const auto& [test, pixels] : last_statistics_.rejected)

@@ -1,9 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <dynamic_reconfigure/Reconfigure.h>
+#include <geometry_msgs/Point.h>
+#include <geometry_msgs/PointStamped.h>
 #include <gmock/gmock.h>
+#include <omnister/StageTimes.h>
 #include <sensor_msgs/PointCloud2.h>
 #include <tf2_ros/static_transform_broadcaster.h>
 #include <tf2_ros/transform_broadcaster.h>
 #include <unistd.h>
+#include <visualization_msgs/MarkerArray.h>
 
 #include <algorithm>
 #include <cmath>
@@ -216,7 +221,7 @@ TEST(Stereo, ListensToImagesOnlyWhileSomebodyListensToIt) {
   const StereoPipeline stereo(camera.node(), parametersFor(camera, "lazy"));
   ros::WallDuration(0.3).sleep();
   EXPECT_EQ(camera.listeners(), 0);
-  for (const std::string topic : {"points2", "depth", "range"}) {
+  for (const std::string topic : {"points2", "depth", "range", "epipolar"}) {
     using Points = Collector<sensor_msgs::PointCloud2>;
     using Images = Collector<sensor_msgs::Image>;
     std::unique_ptr<Points> points;
@@ -313,6 +318,171 @@ TEST(Stereo, ImagesOfAnyDepthAndColourGiveTheSameCloud) {
     cv::Mat both = (result == result) & (results[0] == results[0]);
     EXPECT_GT(cv::countNonZero(both), 0.95 * cv::countNonZero(results[0] == results[0]));
   }
+}
+
+/// Sets what may be set live, and tells what the node made of it.
+StereoConfig configure(const ros::NodeHandle& private_node,
+                       const std::function<void(StereoConfig&)>& change) {
+  dynamic_reconfigure::Reconfigure call;
+  ros::service::waitForService(private_node.resolveName("set_parameters"), ros::Duration(30.0));
+  // An empty request changes nothing and tells how things stand.
+  ros::NodeHandle node = private_node;
+  ros::ServiceClient client =
+      node.serviceClient<dynamic_reconfigure::Reconfigure>("set_parameters");
+  EXPECT_TRUE(client.call(call));
+  StereoConfig config;
+  config.__fromMessage__(call.response.config);
+  change(config);
+  config.__toMessage__(call.request.config);
+  EXPECT_TRUE(client.call(call));
+  config.__fromMessage__(call.response.config);
+  return config;
+}
+
+TEST(Stereo, IsTunedLiveWithinItsLimits) {
+  Camera camera("tuned");
+  const ros::NodeHandle private_node = parametersFor(camera, "tuned");
+  const StereoPipeline stereo(camera.node(), private_node);
+  Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+  Collector<StageTimes> times(camera.node(), "timing");
+  const ros::Time stamp = ros::Time::now();
+  publishPair(camera, stamp - ros::Duration(2.0), stamp);
+  ASSERT_TRUE(eventually([&] { return ranges.size() == 1; }));
+  const auto farthest = [](const sensor_msgs::Image& image) {
+    double most = 0.0;
+    const cv::Mat range = floats(image);
+    for (const float r : cv::Mat_<float>(range))
+      most = std::isnan(r) ? most : std::max<double>(most, r);
+    return most;
+  };
+  EXPECT_GT(farthest(*ranges.last()), 2.0);
+  const StereoConfig nearer = configure(private_node, [](StereoConfig& c) { c.max_range = 1.9; });
+  EXPECT_EQ(nearer.max_range, 1.9);
+  EXPECT_EQ(nearer.min_baseline, 0.1) << "the others stay";
+  publishPair(camera, stamp + ros::Duration(2.0), stamp + ros::Duration(4.0));
+  ASSERT_TRUE(eventually([&] { return ranges.size() >= 2; }));
+  EXPECT_LE(farthest(*ranges.last()), 1.9);
+  EXPECT_GT(farthest(*ranges.last()), 0.5);
+
+  // What contradicts itself stays as it was, and who asked is told.
+  const StereoConfig crossed = configure(private_node, [](StereoConfig& c) {
+    c.min_range = 5.0;
+    c.min_baseline = 0.5;
+    c.epipolar_pixels = "one two";
+  });
+  EXPECT_EQ(crossed.min_range, 0.0);
+  EXPECT_EQ(crossed.min_baseline, 0.1);
+  EXPECT_EQ(crossed.epipolar_pixels, "");
+  StereoConfig preset = configure(private_node, [](StereoConfig& c) { c.preset = "accurate"; });
+  EXPECT_EQ(preset.positions, 4);
+  preset = configure(private_node, [](StereoConfig& c) { c.preset = "balanced"; });
+  EXPECT_EQ(preset.positions, 1);
+  EXPECT_EQ(preset.hypotheses, 0);
+  preset = configure(private_node, [](StereoConfig& c) { c.hypotheses = 99; });
+  EXPECT_EQ(preset.preset, "custom");
+  EXPECT_EQ(preset.hypotheses, 99);
+
+  ASSERT_TRUE(eventually([&] { return times.size() >= 2; }));
+  const StageTimes& first = *times.messages().front();
+  EXPECT_EQ(first.header.stamp, stamp);
+  ASSERT_EQ(first.stages.size(), first.seconds.size());
+  const auto total = std::find(first.stages.begin(), first.stages.end(), "total");
+  ASSERT_NE(total, first.stages.end());
+  const double whole = first.seconds[static_cast<std::size_t>(total - first.stages.begin())];
+  EXPECT_GT(whole, 0.0);
+  double parts = 0.0;
+  for (std::size_t i = 0; i < first.stages.size(); ++i)
+    if (first.stages[i] != "total" && first.stages[i].find("match ") != 0)
+      parts += first.seconds[i];
+  EXPECT_LE(parts, whole + 1e-6);
+  EXPECT_GT(parts, 0.5 * whole);
+}
+
+TEST(Stereo, ShowsEpipolarCurvesOfTheClickedPixels) {
+  Camera camera("clicked");
+  const StereoPipeline stereo(camera.node(), parametersFor(camera, "clicked"));
+  Collector<sensor_msgs::Image> overlays(camera.node(), "epipolar");
+  ros::Publisher pixels = camera.node().advertise<geometry_msgs::Point>("epipolar_mouse_left", 4);
+  ros::Publisher points = camera.node().advertise<geometry_msgs::PointStamped>("clicked_point", 4);
+  ASSERT_TRUE(eventually([&] { return pixels.getNumSubscribers() && points.getNumSubscribers(); }));
+  geometry_msgs::Point pixel;
+  pixel.x = 120;
+  pixel.y = 170;
+  pixels.publish(pixel);
+  pixel.x = 790;  // the right half picks nothing
+  pixels.publish(pixel);
+  const ros::Time stamp = ros::Time::now();
+  publishPair(camera, stamp - ros::Duration(2.0), stamp);
+  ASSERT_TRUE(eventually([&] { return overlays.size() == 1; }));
+  const auto changed = [&](const sensor_msgs::Image& overlay, int u, int v) {
+    EXPECT_EQ(overlay.width, 800u);
+    EXPECT_EQ(overlay.encoding, "bgr8");
+    const cv::Mat picture(300, 800, CV_8UC3, const_cast<std::uint8_t*>(overlay.data.data()),
+                          overlay.step);
+    const cv::Rect around(u - 6, v - 6, 13, 13);
+    return cv::norm(picture(around), views().right(around), cv::NORM_INF) > 60.0;
+  };
+  EXPECT_EQ(overlays.last()->header.stamp, stamp);
+  EXPECT_TRUE(changed(*overlays.last(), 120, 170));
+  EXPECT_FALSE(changed(*overlays.last(), 40, 40));
+
+  // A point in space, as rviz publishes it, is picked where the camera sees it.
+  geometry_msgs::PointStamped point;
+  point.header.frame_id = camera.optical();
+  const auto ray = views().lens.lens->unproject({40.0, 60.0});
+  ASSERT_TRUE(ray);
+  point.point.x = 3.0 * ray->x();
+  point.point.y = 3.0 * ray->y();
+  point.point.z = 3.0 * ray->z();
+  points.publish(point);
+  int lap = 0;
+  EXPECT_TRUE(eventually(
+      [&] {
+        lap += 4;
+        publishPair(camera, stamp + ros::Duration(lap), stamp + ros::Duration(lap + 2.0));
+        const std::size_t before = overlays.size();
+        eventually([&] { return overlays.size() > before; });
+        return changed(*overlays.last(), 40, 60);
+      },
+      60.0));
+}
+
+TEST(Stereo, ShowsTheLensSurfaceToWhoComesLate) {
+  Camera camera("shown");
+  ros::NodeHandle private_node = parametersFor(camera, "shown");
+  private_node.deleteParam("lens");
+  const StereoPipeline stereo(camera.node(), private_node);
+  ros::Publisher lenses = camera.node().advertise<LensModelMessage>("lens_model", 1, true);
+  std_msgs::Header header;
+  header.stamp = ros::Time::now();
+  header.frame_id = camera.optical();
+  lenses.publish(toLensModelMessage(lensFile(), header));
+  ros::WallDuration(0.2).sleep();
+  Collector<visualization_msgs::MarkerArray> markers(camera.node(), "lens_surface");
+  ASSERT_TRUE(eventually([&] { return markers.size() > 0; }));
+  ASSERT_EQ(markers.last()->markers.size(), 3u);
+  const visualization_msgs::Marker& surface = markers.last()->markers[0];
+  EXPECT_EQ(surface.header.frame_id, camera.optical());
+  EXPECT_EQ(surface.ns, "surface");
+  ASSERT_GT(surface.points.size(), 1000u);
+  ASSERT_EQ(surface.points.size() % 3, 0u);
+  ASSERT_EQ(surface.points.size(), surface.colors.size());
+  // Every vertex stands over the pixel that its direction projects to, in one scale.
+  const LensModel& lens = *lensFile().lens;
+  double scale = 0.0;
+  for (const auto& p : surface.points) {
+    const Eigen::Vector3d at(p.x, p.y, p.z);
+    const auto pixel = lens.project(at);
+    ASSERT_TRUE(pixel);
+    const double r = (*pixel - lens.center()).norm();
+    if (r < 5.0) continue;
+    if (scale == 0.0) scale = at.head<2>().norm() / r;
+    ASSERT_NEAR(at.head<2>().norm() / r, scale, 1e-3 * scale);
+  }
+  ASSERT_GT(scale, 0.0);
+  EXPECT_EQ(markers.last()->markers[1].ns, "sphere");
+  for (const auto& p : markers.last()->markers[1].points)
+    ASSERT_NEAR(std::sqrt(p.x * p.x + p.y * p.y + p.z * p.z), 0.1, 1e-9);
 }
 
 /// Plays a pair of two cameras into a node set up by parameters. @param name namespace, unique

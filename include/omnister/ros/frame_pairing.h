@@ -68,6 +68,9 @@ class FramePairing {
   /// @throws Error for options that contradict themselves
   explicit FramePairing(const PairingOptions& options);
 
+  /// Frames are kept; the next set is made by these. @throws Error as the constructor
+  void setOptions(const PairingOptions& options);
+
   /// @param now time by the clock that stamps are from [ns]
   void add(PairingFrame frame, std::int64_t now_ns);
 

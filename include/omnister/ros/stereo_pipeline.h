@@ -3,10 +3,14 @@
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
+#include <dynamic_reconfigure/server.h>
+#include <geometry_msgs/Point.h>
+#include <geometry_msgs/PointStamped.h>
 #include <image_transport/image_transport.h>
 #include <image_transport/subscriber_filter.h>
 #include <message_filters/sync_policies/approximate_time.h>
 #include <message_filters/synchronizer.h>
+#include <omnister/StereoConfig.h>
 #include <ros/ros.h>
 #include <tf2_ros/buffer.h>
 #include <tf2_ros/transform_listener.h>
@@ -42,13 +46,17 @@ struct StereoParameters {
   double min_period = 0.0;  ///< between the beginnings of two matches [s]; of `max_rate`
   MatcherOptions matching;  ///< with the mask
   std::string matcher = "sweep";
+  std::string preset = "custom";  ///< of positions, hypotheses and matcher, see cfg/Stereo.cfg
+  std::string epipolar_pixels;    ///< of the overlay, see parsePixels(); empty: defaultPixels()
 };
 
 /// @throws InputError naming key, value and range, or the mask file
 StereoParameters loadStereoParameters(Parameters& parameters);
 
-/// Subscribes only while somebody listens to `points2`, `depth` or `range`. Matching has its own
-/// thread and takes the newest set; whatever it cannot keep up with is dropped and counted.
+/// Subscribes only while somebody listens to `points2`, `depth`, `range` or `epipolar`. Matching
+/// has its own thread and takes the newest set; whatever it cannot keep up with is dropped and
+/// counted. What cfg/Stereo.cfg names can be changed live; a frame is matched with one set of
+/// values.
 class StereoPipeline {
  public:
   /// Returns at once. @throws Error for parameters that do not hold; nothing is then left running.
@@ -71,6 +79,7 @@ class StereoPipeline {
     std::vector<Pose> T_ref_disp;
   };
   struct CachedMatcher {
+    std::size_t generation;  ///< of live_ it was made with
     StereoGeometry geometry;
     std::unique_ptr<Matcher> matcher;
   };
@@ -80,6 +89,11 @@ class StereoPipeline {
   void onConnection();
   void subscribe();
   void unsubscribe();
+  void configure(StereoConfig& config);
+  void onClickedPoint(const geometry_msgs::PointStamped& point);
+  void onClickedPixel(const geometry_msgs::Point& pixel);
+  void pick(const Eigen::Vector2d& pixel);  ///< mutex_ is held
+  void publishLens(const std::string& frame_id);
   void onLens(const LensModelMessage::ConstPtr& message, std::size_t eye);
   void onImage(const sensor_msgs::ImageConstPtr& image);
   void onImages(const sensor_msgs::ImageConstPtr& left, const sensor_msgs::ImageConstPtr& right);
@@ -90,7 +104,10 @@ class StereoPipeline {
   void pollPairing();        ///< mutex_ is held
   void putPending(Job job);  ///< mutex_ is held
   void process(const Job& job);
-  Matcher& matcherFor(const StereoGeometry& geometry);
+  Matcher& matcherFor(const StereoGeometry& geometry, const StereoParameters& live,
+                      std::size_t generation);
+  void publishOverlay(const Job& job, const StereoGeometry& geometry, const StereoParameters& live,
+                      const MatchResult& result, int bits);
   const cv::Mat& raysOf(const LensFile& file);
   PoseAnswer cameraPose(const std::string& frame_id, std::int64_t stamp_ns) const;
   std::optional<Pose> rigPose(const sensor_msgs::Image& left, const sensor_msgs::Image& right,
@@ -100,7 +117,7 @@ class StereoPipeline {
   /// Counts a dropped frame or set and remembers why; `fault`: also warns, throttled by name.
   void drop(const std::string& name, const std::string& reason, bool fault);
 
-  const StereoParameters parameters_;
+  const StereoParameters parameters_;  ///< as loaded; what may change is in live_
   std::optional<Pose> T_left_right_;
   ros::NodeHandle node_;
   image_transport::ImageTransport transport_;
@@ -111,6 +128,10 @@ class StereoPipeline {
   ros::Publisher points_publisher_;
   ros::Publisher depth_publisher_;
   ros::Publisher range_publisher_;
+  ros::Publisher epipolar_publisher_;
+  ros::Publisher times_publisher_;
+  ros::Publisher lens_publisher_;
+  std::vector<ros::Subscriber> click_subscribers_;
   image_transport::Subscriber image_subscriber_;
   std::unique_ptr<image_transport::SubscriberFilter> left_subscriber_;
   std::unique_ptr<image_transport::SubscriberFilter> right_subscriber_;
@@ -122,6 +143,11 @@ class StereoPipeline {
   std::condition_variable wake_;
   bool stopping_ = false;
   std::vector<Eye> eyes_;
+  StereoParameters live_;
+  std::size_t generation_ = 0;        ///< of live_
+  std::vector<cv::Point2d> clicked_;  ///< pixels of the overlay; empty: those of live_
+  std::string reference_frame_;       ///< optical frame of the last reference image
+  std::string lens_frame_;            ///< the frame that the lens marker was published in
   FramePairing pairing_;
   std::optional<Job> pending_;  ///< newest set that waits to be matched
   std::map<std::string, std::size_t> drops_;
@@ -131,7 +157,6 @@ class StereoPipeline {
   ros::SteadyTime last_start_;  ///< of a match
   ros::SteadyTime last_cloud_;  ///< or since when somebody listens
   MatchStatistics last_statistics_;
-  double last_seconds_ = 0.0;
 
   std::list<CachedMatcher> matchers_;  ///< most recently used first; worker only
   LensPtr rays_lens_;                  ///< of rays_; worker only
@@ -140,6 +165,8 @@ class StereoPipeline {
 
   diagnostic_updater::Updater diagnostics_;
   ros::SteadyTimer diagnostics_timer_;
+  boost::recursive_mutex config_mutex_;
+  std::unique_ptr<dynamic_reconfigure::Server<StereoConfig>> config_server_;
 };
 
 }  // namespace omnister
