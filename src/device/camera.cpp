@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/device/camera.h"
 
+#include "omnister/device/aravis_camera.h"
 #include "omnister/device/replay_camera.h"
 
 namespace omnister::device {
@@ -10,12 +11,18 @@ Stamp now() {
 }
 
 std::unique_ptr<Camera> openCamera(const std::string& device, const CameraSettings& settings) {
-  const std::string replay = "replay:";
-  if (device.rfind(replay, 0) == 0 && device.size() > replay.size()) {
-    return makeReplayCamera(readRecording(device.substr(replay.size())), settings);
+  const auto rest = [&device](const std::string& backend) -> std::optional<std::string> {
+    if (device.rfind(backend + ":", 0) != 0) return std::nullopt;
+    return device.substr(backend.size() + 1);
+  };
+  if (const auto path = rest("replay"); path && !path->empty()) {
+    return makeReplayCamera(readRecording(*path), settings);
   }
+  if (const auto which = rest("aravis")) return openAravisCamera(*which, settings);
   throw InputError("device", "",
-                   "is \"" + printable(device) + "\", expected replay:DIR (recorded images)");
+                   "is \"" + printable(device) +
+                       "\", expected aravis:SERIAL (GigE or USB3 Vision) or replay:DIR (recorded "
+                       "images)");
 }
 
 }  // namespace omnister::device

@@ -64,6 +64,7 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   p.settings.pixel_format = source.text("pixel_format", "");
   p.settings.trigger =
       source.choice("trigger", "off", {"off", "software", "line0", "line1", "line2", "line3"});
+  p.settings.ptp = source.flag("ptp", false);
   p.settings.loop = source.flag("loop", false);
   p.settings.paced = source.flag("paced", true);
   p.settings.recorded_stamps = source.flag("recorded_stamps", false);
