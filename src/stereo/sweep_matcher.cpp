@@ -10,12 +10,14 @@
 #include <limits>
 #include <numeric>
 
+#include "multi_position.h"
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
 #include "omnister/stereo/matching_limits.h"
 #include "sweep_filters.h"
 #include "sweep_geometry.h"
 #include "sweep_kernels.h"
+#include "sweep_pair.h"
 
 namespace omnister {
 namespace {
@@ -86,7 +88,7 @@ cv::Mat makePlane(cv::Size size, int type) {
   return room.colRange(0, size.width);
 }
 
-class SweepMatcher : public Matcher {
+class SweepMatcher : public SweepPair {
  public:
   SweepMatcher(const StereoGeometry& geometry, const MatcherOptions& options)
       : geometry_(geometry), options_(options) {
@@ -150,6 +152,39 @@ class SweepMatcher : public Matcher {
     result.statistics.seconds["total"] =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     return result;
+  }
+
+  void takeBuffers(SweepPair* pair) override {
+    auto* other = dynamic_cast<SweepMatcher*>(pair);
+    if (other == nullptr || other == this) return;
+    for (std::size_t l = 0; l < std::min(levels_.size(), other->levels_.size()); ++l) {
+      Level& own = levels_[l];
+      Level& theirs = other->levels_[l];
+      const cv::Size size(own.displaced.width, own.displaced.height);
+      own.reference = std::move(theirs.reference);
+      own.displaced = std::move(theirs.displaced);
+      own.displaced.create(size.width, size.height);
+      own.h = theirs.h;
+      theirs.h.release();
+      for (int p = 0; p < kPlanes; ++p) {
+        own.cells[p] = std::move(theirs.cells[p]);
+        own.cells[p].resize(own.grid.cells + 2 * own.slack);
+        // Stray reads find nothing there, as in a vector of one's own.
+        std::fill_n(own.cells[p].begin(), own.slack, std::uint8_t{0});
+        std::fill_n(own.cells[p].end() - own.slack, own.slack, std::uint8_t{0});
+      }
+    }
+    for (auto member : {&SweepMatcher::value_, &SweepMatcher::steep_, &SweepMatcher::claim_,
+                        &SweepMatcher::smooth_}) {
+      this->*member = other->*member;
+      (other->*member).release();
+    }
+    for (int i = 0; i < 3; ++i) {
+      planes_[i] = other->planes_[i];
+      other->planes_[i].release();
+    }
+    claims_ = std::move(other->claims_);
+    claims_.resize(static_cast<std::size_t>(claim_size_.area()));
   }
 
  private:
@@ -691,81 +726,19 @@ class SweepMatcher : public Matcher {
   std::vector<std::pair<int, int>> claim_rows_;  ///< by tile, first and last
 };
 
-/// Several displaced images, matched pair by pair; what agrees is averaged by its weight.
-class PairwiseMatcher : public Matcher {
- public:
-  PairwiseMatcher(const StereoGeometry& geometry, const MatcherOptions& options)
-      : geometry_(geometry) {
-    for (const auto& displaced : geometry.displaced) {
-      StereoGeometry pair = geometry;
-      pair.displaced = {displaced};
-      matchers_.push_back(std::make_unique<SweepMatcher>(pair, options));
-    }
-  }
-
-  MatchResult match(const cv::Mat& reference, const std::vector<cv::Mat>& displaced) override {
-    checkImages(geometry_, reference, displaced);
-    std::vector<MatchResult> results;
-    for (std::size_t i = 0; i < matchers_.size(); ++i)
-      results.push_back(matchers_[i]->match(reference, {displaced[i]}));
-    MatchResult out = results.front();
-    for (std::size_t i = 1; i < results.size(); ++i) {
-      for (const auto& [name, seconds] : results[i].statistics.seconds)
-        out.statistics.seconds[name] += seconds;
-      for (const auto& [name, count] : results[i].statistics.rejected)
-        out.statistics.rejected[name] += count;
-    }
-    out.statistics.valid = 0;
-    for (int y = 0; y < reference.rows; ++y) {
-      for (int x = 0; x < reference.cols; ++x) {
-        // The estimate that carries most weight leads; others join when they agree with it.
-        const auto weight = [&](const MatchResult& r) {
-          const double sigma = r.sigma.at<float>(y, x), range = r.range.at<float>(y, x);
-          return std::isnan(range) ? 0.0 : std::pow(range * range / sigma, 2);  // of 1 / range
-        };
-        double best = 0, inverse = 0;
-        for (const auto& r : results) {
-          const double w = weight(r);
-          if (w <= best) continue;
-          best = w;
-          inverse = 1.0 / r.range.at<float>(y, x);
-        }
-        if (best == 0) {
-          out.range.at<float>(y, x) = out.sigma.at<float>(y, x) = out.score.at<float>(y, x) = kNaN;
-          continue;
-        }
-        double sum = 0, weights = 0, score = 0;
-        for (const auto& r : results) {
-          const double w = weight(r);
-          if (w == 0) continue;
-          const double value = 1.0 / r.range.at<float>(y, x);
-          if (std::fabs(value - inverse) > 4 * std::sqrt(1 / w + 1 / best)) continue;
-          sum += w * value;
-          weights += w;
-          score = std::max<double>(score, r.score.at<float>(y, x));
-        }
-        const double range = weights / sum;
-        out.range.at<float>(y, x) = static_cast<float>(range);
-        out.sigma.at<float>(y, x) = static_cast<float>(range * range / std::sqrt(weights));
-        out.score.at<float>(y, x) = static_cast<float>(score);
-        ++out.statistics.valid;
-      }
-    }
-    return out;
-  }
-
- private:
-  StereoGeometry geometry_;
-  std::vector<std::unique_ptr<SweepMatcher>> matchers_;
-};
-
 }  // namespace
 
 std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
                                           const MatcherOptions& options) {
   checkMatching(geometry, options);
   sweep::holdSimdByEnvironment();
-  if (geometry.displaced.size() > 1) return std::make_unique<PairwiseMatcher>(geometry, options);
+  if (geometry.displaced.size() > 1) return makeMultiPositionMatcher(geometry, options);
+  return std::make_unique<SweepMatcher>(geometry, options);
+}
+
+std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,
+                                         const MatcherOptions& options) {
+  checkMatching(geometry, options);
   return std::make_unique<SweepMatcher>(geometry, options);
 }
 

@@ -47,10 +47,10 @@ class PointMaker {
   /// @param mask CV_8UC1 of the size given before
   std::size_t countField(const cv::Mat& mask = {}) const;
 
- private:
   /// Rays of a row, NaN outside the field. @param nodes scratch
   void row(int v, std::vector<cv::Vec3f>& nodes, cv::Vec3f* rays) const;
 
+ private:
   cv::Size size_;
   cv::Size cells_;                 // of 8 x 8 pixels
   cv::Mat nodes_;                  // CV_32FC3, one node before and two after the cells

@@ -1,0 +1,23 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file The sweep of one pair, for those who match several.
+#pragma once
+
+#include <memory>
+
+#include "omnister/stereo/matcher.h"
+
+namespace omnister {
+
+class SweepPair : public Matcher {
+ public:
+  /// Takes over what `other`, of the same reference image, works in, so that only one of them needs
+  /// the memory: the one that took it last may match. Results are the same.
+  virtual void takeBuffers(SweepPair* other) = 0;
+};
+
+/// @param geometry with one displaced camera
+/// @throws Error as makeMatcher()
+std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,
+                                         const MatcherOptions& options);
+
+}  // namespace omnister
