@@ -1,7 +1,7 @@
 # The catkin side of the package: messages, exports, install destinations.
 set(OMNISTER_CATKIN_COMPONENTS
   actionlib actionlib_msgs cv_bridge diagnostic_updater dynamic_reconfigure geometry_msgs
-  image_transport message_filters message_generation nodelet pluginlib rosbag rosbag_storage roscpp
+  image_transport interactive_markers message_filters message_generation nodelet pluginlib rosbag rosbag_storage roscpp
   sensor_msgs std_msgs std_srvs tf2 tf2_ros visualization_msgs)
 find_package(catkin REQUIRED COMPONENTS ${OMNISTER_CATKIN_COMPONENTS})
 

@@ -103,8 +103,8 @@ std::vector<cv::Point2d> defaultPixels(cv::Size size) {
   const double w = size.width - 1;
   const double h = size.height - 1;
   return {{0.5 * w, 0.5 * h},
-          {0.22 * w, 0.5 * h},
-          {0.78 * w, 0.5 * h},
+          {0.22 * w, 0.4 * h},
+          {0.6 * w, 0.6 * h},
           {0.5 * w, 0.2 * h},
           {0.5 * w, 0.8 * h}};
 }

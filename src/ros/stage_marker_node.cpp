@@ -1,0 +1,17 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <ros/ros.h>
+
+#include "omnister/ros/stage_marker.h"
+
+int main(int argc, char** argv) {
+  ros::init(argc, argv, "stage_marker");
+  try {
+    const omnister::StageMarker marker{ros::NodeHandle(), ros::NodeHandle("~")};
+    // One thread may wait for a service while others go on.
+    ros::MultiThreadedSpinner(2).spin();
+  } catch (const std::exception& error) {
+    ROS_FATAL("%s", error.what());
+    return 1;
+  }
+  return 0;
+}
