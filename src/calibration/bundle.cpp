@@ -103,7 +103,7 @@ class Blocks : public ceres::EvaluationCallback {
     for (std::size_t i = 0; i < pose_blocks.size(); ++i) state.poses[i] = poseOf(pose_blocks[i]);
     state.warp = warp;
     state.T_right_left = poseOf(rig);
-    state.axis = axis.normalized();
+    state.axis = axis;
     return state;
   }
 
@@ -294,7 +294,9 @@ bool adjust(const std::vector<BundleView>& views, const BundleOptions& options,
   if (used_right) shared(blocks.rig.data(), options.rig);
   if (options.axis) {
     shared(blocks.axis.data(), true);
-    problem.SetManifold(blocks.axis.data(), new ceres::SphereManifold<3>);
+    if (!options.axis_length) {
+      problem.SetManifold(blocks.axis.data(), new ceres::SphereManifold<3>);
+    }
   }
 
   ceres::Solver::Options solver;
@@ -316,6 +318,7 @@ bool adjust(const std::vector<BundleView>& views, const BundleOptions& options,
   for (const LensPtr& lens : result.lenses) {
     if (!lens) return false;
   }
+  if (options.axis && !options.axis_length) result.axis *= state.axis.norm() / result.axis.norm();
   state = std::move(result);
   return true;
 }
@@ -386,6 +389,17 @@ double refinePose(const std::vector<BundleView>& views, double loss_px, BundleSt
   return std::sqrt(squares / static_cast<double>(count));
 }
 
+Eigen::Matrix<double, 3, 2> axisTangents(const Eigen::Vector3d& axis) {
+  Eigen::Vector3d least = Eigen::Vector3d::Zero();
+  Eigen::Index place = 0;
+  axis.cwiseAbs().minCoeff(&place);
+  least[place] = 1.0;
+  Eigen::Matrix<double, 3, 2> tangents;
+  tangents.col(0) = axis.cross(least).normalized();
+  tangents.col(1) = axis.cross(tangents.col(0)).normalized();
+  return tangents;
+}
+
 Eigen::MatrixXd reducedInformation(const std::vector<BundleView>& views,
                                    const BundleOptions& options, const BundleState& state) {
   // Columns: lens of each camera, warp, rig, axis.
@@ -400,7 +414,10 @@ Eigen::MatrixXd reducedInformation(const std::vector<BundleView>& views,
   const int rig_column = columns;
   columns += options.rig ? 6 : 0;
   const int axis_column = columns;
-  columns += options.axis ? 3 : 0;
+  const Eigen::MatrixXd axis_steps = options.axis_length
+                                         ? Eigen::MatrixXd(Eigen::Matrix3d::Identity())
+                                         : Eigen::MatrixXd(axisTangents(state.axis));
+  columns += options.axis ? static_cast<int>(axis_steps.cols()) : 0;
 
   const Blocks blocks(state);
   Eigen::MatrixXd information = Eigen::MatrixXd::Zero(columns, columns);
@@ -423,7 +440,9 @@ Eigen::MatrixXd reducedInformation(const std::vector<BundleView>& views,
       }
       if (options.warp) row.middleCols(warp_column, 2) << corner.d_k1, corner.d_k2;
       if (options.rig && rig) row.middleCols(rig_column, 6) = corner.d_rig;
-      if (options.axis) row.middleCols(axis_column, 3) = -view.travel * corner.d_point;
+      if (options.axis) {
+        row.middleCols(axis_column, axis_steps.cols()) = -view.travel * corner.d_point * axis_steps;
+      }
       information.noalias() += row.transpose() * row;
       couple.noalias() += row.transpose() * corner.d_pose;
       pose_information[view.pose].noalias() += corner.d_pose.transpose() * corner.d_pose;

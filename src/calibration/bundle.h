@@ -26,7 +26,9 @@ struct BundleState {
   std::vector<Pose> poses;  ///< T_camera_plane
   Eigen::Vector2d warp = Eigen::Vector2d::Zero();
   Pose T_right_left = Pose::Identity();
-  Eigen::Vector3d axis = Eigen::Vector3d::UnitX();  ///< unit vector of travel, camera frame
+  /// Way of the camera for one unit of travel, camera frame: a unit vector where stage and board
+  /// share their unit of length.
+  Eigen::Vector3d axis = Eigen::Vector3d::UnitX();
 };
 
 struct BundleOptions {
@@ -34,7 +36,8 @@ struct BundleOptions {
   bool warp = true;
   bool rig = false;
   bool axis = false;
-  double loss_px = 0.0;  ///< scale of the Cauchy loss [px]; 0: plain least squares
+  bool axis_length = false;  ///< with `axis`: its length too, the stage's unit against the board's
+  double loss_px = 0.0;      ///< scale of the Cauchy loss [px]; 0: plain least squares
   int max_iterations = 60;
   double tolerance = 1e-10;  ///< relative change of cost at which to stop
 };
@@ -63,8 +66,12 @@ std::vector<Eigen::Vector2d> residualsOf(const BundleView& view, const BundleSta
 double refinePose(const std::vector<BundleView>& views, double loss_px, BundleState& state,
                   int max_iterations = 30);
 
+/// Two unit vectors square to `axis`: the directions in which an axis of fixed length can turn.
+Eigen::Matrix<double, 3, 2> axisTangents(const Eigen::Vector3d& axis);
+
 /// The information about lens parameters, warp, rig and axis (in that order, those that are free)
 /// with the poses eliminated: J^T J - J^T Jp (Jp^T Jp)^-1 Jp^T J in 1/px^2 per unit of parameter.
+/// An axis of fixed length has two columns, steps along its axisTangents(); else three.
 Eigen::MatrixXd reducedInformation(const std::vector<BundleView>& views,
                                    const BundleOptions& options, const BundleState& state);
 

@@ -13,6 +13,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
 #include "omnister/common/parallel.h"
+#include "stage.h"
 
 namespace omnister {
 namespace calibration {
@@ -126,6 +127,7 @@ Prepared prepareViews(const Detections& detections, bool warp, const Board* boar
     prepared.input.index.push_back(static_cast<int>(v));
     prepared.input.corners.push_back(std::move(corners));
   }
+  prepared.input.separate();
   if (prepared.input.corners.size() < 3) {
     throw Error("calibration needs at least 3 different views of the board, " +
                 std::to_string(prepared.input.corners.size()) + " of " +
@@ -160,10 +162,7 @@ Fit trustedFirstFit(Prepared& prepared, int threads) {
   std::nth_element(sorted.begin(), sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2),
                    sorted.end());
   const double typical = sorted[sorted.size() / 2];
-  FitInput kept = input;
-  kept.names.clear();
-  kept.index.clear();
-  kept.corners.clear();
+  std::vector<bool> trusted(residuals.size(), false);
   Fit fit = *first;
   fit.state.poses.clear();
   for (std::size_t i = 0; i < residuals.size(); ++i) {
@@ -177,9 +176,7 @@ Fit trustedFirstFit(Prepared& prepared, int threads) {
       reason = "its corners are mirrored against those of the other views";
     }
     if (reason.empty()) {
-      kept.names.push_back(input.names[i]);
-      kept.index.push_back(input.index[i]);
-      kept.corners.push_back(input.corners[i]);
+      trusted[i] = true;
       fit.state.poses.push_back(first->state.poses[i]);
       continue;
     }
@@ -188,6 +185,8 @@ Fit trustedFirstFit(Prepared& prepared, int threads) {
     view.reason = reason;
     prepared.warnings.push_back("view '" + view.name + "' is not used: " + reason);
   }
+  FitInput kept = input.subset(trusted);
+  kept.separate();
   if (kept.corners.size() < 3) {
     throw Error("calibration needs at least 3 views that agree, " +
                 std::to_string(kept.corners.size()) + " do: " + joined(prepared.warnings, 3));
@@ -385,9 +384,8 @@ Selection selectStructure(const FitInput& input, const Fit& first,
   return selection;
 }
 
-Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const BundleOptions& options,
-                               const BundleState& state, double loss_px, int camera,
-                               double least_sigma_px) {
+Eigen::MatrixXd sharedCovariance(const std::vector<BundleView>& views, const BundleOptions& options,
+                                 const BundleState& state, double loss_px, double least_sigma_px) {
   const Eigen::MatrixXd information = reducedInformation(views, options, state);
   // Parameters differ by many orders of magnitude: bring the diagonal to one, and let a direction
   // that nothing determines have a variance that is huge but finite.
@@ -427,12 +425,18 @@ Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const Bundl
   const double slope = std::max(psi_slope / count, 0.05);
   const double variance =
       std::max(psi_squared / count / freedom / (slope * slope), least_sigma_px * least_sigma_px);
+  return variance * covariance;
+}
 
+Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const BundleOptions& options,
+                               const BundleState& state, double loss_px, int camera,
+                               double least_sigma_px) {
   Eigen::Index first = 0;
   for (int i = 0; i < camera; ++i)
     first += state.lenses[static_cast<std::size_t>(i)]->parameters().size();
   const Eigen::Index size = state.lenses[static_cast<std::size_t>(camera)]->parameters().size();
-  return variance * covariance.block(first, first, size, size);
+  return sharedCovariance(views, options, state, loss_px, least_sigma_px)
+      .block(first, first, size, size);
 }
 
 void refuseUndetermined(const FitInput& input, const BundleState& state, const LensModel& lens,
@@ -444,7 +448,10 @@ void refuseUndetermined(const FitInput& input, const BundleState& state, const L
   for (const Pose& pose : state.poses) largest = std::max(largest, tilt(pose));
   // Boards all square to the axis fix nothing but ratios (Johnson 1997, sec. 4.3, took them for
   // metric); whatever else then settles the scale is the model's prejudice.
-  const bool all_square = degrees(largest) < 3.0;
+  // Steps of a stage that lead towards the board settle it too.
+  const bool towards =
+      input.stage && std::abs(state.axis.normalized().z()) > std::sin(3.0 * kPi / 180.0);
+  const bool all_square = degrees(largest) < 3.0 && !towards;
   if (field.rms_px <= limit && !all_square) return;
   double low_x = HUGE_VAL;
   double high_x = -HUGE_VAL;
@@ -510,6 +517,25 @@ void warnOfCoverage(const FitInput& input, const LensModel& lens,
   }
 }
 
+/// Standard deviation of focalLength().
+double heightSigma(const LensModel& lens, const Eigen::MatrixXd& covariance) {
+  const Eigen::VectorXd values = lens.parameters();
+  Eigen::VectorXd slope = Eigen::VectorXd::Zero(values.size());
+  for (Eigen::Index i = 0; i < values.size(); ++i) {
+    // A step that the data would not notice, so that the numbers stay those of a lens.
+    const double step = 1e-3 * std::sqrt(std::max(covariance(i, i), 0.0)) + 1e-9;
+    Eigen::VectorXd low = values;
+    Eigen::VectorXd high = values;
+    low[i] -= step;
+    high[i] += step;
+    const LensPtr below = lens.withParameters(low);
+    const LensPtr above = lens.withParameters(high);
+    if (!below || !above) return std::nan("");
+    slope[i] = (focalLength(*above) - focalLength(*below)) / (2.0 * step);
+  }
+  return std::sqrt(std::max(0.0, slope.dot(covariance * slope)));
+}
+
 }  // namespace
 
 CalibrationResult assembleResult(const Prepared& prepared, const Selection& selection,
@@ -532,7 +558,9 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
   std::vector<double> view_rms;
   for (std::size_t i = 0; i < residuals.size(); ++i) {
     ViewResult& view = result.views[static_cast<std::size_t>(input.index[i])];
-    view.T_camera_board = fit.state.poses[i] * input.board.T_plane_board;
+    Pose T_camera_plane = fit.state.poses[static_cast<std::size_t>(input.pose[i])];
+    T_camera_plane.translation() -= input.travel[i] * fit.state.axis;
+    view.T_camera_board = T_camera_plane * input.board.T_plane_board;
     view.residuals = residuals[i];
     view.rms_px = statisticsOf({residuals[i]}).rms_px;
     view_rms.push_back(view.rms_px);
@@ -564,6 +592,8 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
                               joined(outliers));
   }
   const LensPtr lens = fit.state.lenses[0];
+  result.height_px = focalLength(*lens);
+  result.height_sigma_px = heightSigma(*lens, covariance);
   warnOfCoverage(input, *lens, result.warnings);
 
   const ProjectionField uncertainty = projectionUncertainty(*lens, covariance, input.image_size);
@@ -628,14 +658,14 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
   };
   report(0.0, "finding a first lens");
   Prepared prepared = prepareViews(detections, options.board_warp);
-  const Fit first = trustedFirstFit(prepared, options.threads);
+  Fit first = trustedFirstFit(prepared, options.threads);
+  if (hasStage(detections)) first = joinByStage(detections, prepared, first);
   FitInput& input = prepared.input;
   report(0.2, "choosing the lens model");
 
   // What no structure can mend is told before any choice.
-  const auto views = bundleViews(input.corners);
-  BundleOptions free;
-  free.warp = options.board_warp;
+  const auto views = bundleViews(input);
+  const BundleOptions free = input.freedom();
   refuseUndetermined(input, first.state, *first.state.lenses[0],
                      lensCovariance(views, free, first.state, first.loss_px, 0, kDoubtSigmaPx),
                      input.image_size);
@@ -664,6 +694,15 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
   report(0.96, "estimating uncertainty");
   const auto compared = refit(input, fit, richer);
   CalibrationResult result = assembleResult(prepared, selection, options, covariance, compared);
+  if (input.stage) {
+    const StageResult stage = judgeStage(input, fit, result.warnings);
+    result.file.stage_axis = stage.axis;
+    auto& notes = result.file.calibration.notes;
+    notes["stage_axis_sigma_rad"] = formatNumber(stage.axis_sigma_rad);
+    notes["stage_scale"] = formatNumber(stage.scale);
+    notes["stage_scale_sigma"] = formatNumber(stage.scale_sigma);
+    result.stage = stage;
+  }
   report(1.0, "estimating uncertainty");
   return result;
 }

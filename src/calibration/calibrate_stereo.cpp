@@ -273,6 +273,7 @@ StereoCalibrationResult calibrateStereo(const Detections& left, const Detections
       joined.corners.push_back(input.corners[place]);
       poses.push_back(camera == 0 ? state.poses[i] : state.T_right_left * state.poses[i]);
     }
+    joined.separate();
     input = std::move(joined);
     selection.fit.state.lenses = {state.lenses[static_cast<std::size_t>(camera)]};
     selection.fit.state.poses = std::move(poses);

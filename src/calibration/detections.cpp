@@ -8,6 +8,7 @@
 #include <tuple>
 #include <unordered_map>
 
+#include "csv_fields.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
@@ -16,27 +17,12 @@ namespace omnister {
 
 namespace {
 
+using namespace calibration;
+
 constexpr std::array<std::string_view, 6> kColumns = {"view", "u_px", "v_px", "x_m", "y_m", "z_m"};
 constexpr std::string_view kHeader = "view,u_px,v_px,x_m,y_m,z_m";
 constexpr double kLargestCoordinate = 1e9;
 constexpr std::size_t kLongestName = 4096;
-
-std::string_view trimmed(std::string_view text) {
-  const auto blank = [](char c) { return c == ' ' || c == '\t' || c == '\r'; };
-  while (!text.empty() && blank(text.front())) text.remove_prefix(1);
-  while (!text.empty() && blank(text.back())) text.remove_suffix(1);
-  return text;
-}
-
-std::string inQuotes(std::string_view text) { return "'" + printable(text, 60) + "'"; }
-
-/// The next line without its end; moves `text` behind it.
-std::string_view takeLine(std::string_view& text) {
-  const std::size_t end = text.find('\n');
-  const std::string_view line = text.substr(0, end);
-  text.remove_prefix(end == std::string_view::npos ? text.size() : end + 1);
-  return line;
-}
 
 class DetectionsParser {
  public:
@@ -49,8 +35,6 @@ class DetectionsParser {
     if (detections_.image_size.width <= 0 || detections_.image_size.height <= 0) {
       throw InputError(source_, "", "needs an image size of at least 1x1 pixels");
     }
-    // Spreadsheets put a byte order mark in front.
-    if (text_.substr(0, 3) == "\xEF\xBB\xBF") text_.remove_prefix(3);
     parseHeader();
     while (!text_.empty()) {
       ++line_number_;
@@ -71,10 +55,7 @@ class DetectionsParser {
 
   void parseHeader() {
     line_number_ = 1;
-    std::string header;
-    for (const char c : trimmed(takeLine(text_)).substr(0, 200)) {
-      if (c != ' ' && c != '\t') header += c;
-    }
+    const std::string header = takeHeader(text_);
     if (header != kHeader) {
       refuse("", "is " + inQuotes(header) + ", expected the header " + std::string(kHeader));
     }
@@ -92,17 +73,10 @@ class DetectionsParser {
   }
 
   void parseRow(std::string_view line) {
-    std::array<std::string_view, kColumns.size()> fields;
-    std::size_t count = 0;
-    for (std::string_view rest = line;; ++count) {
-      const std::size_t comma = rest.find(',');
-      if (count < fields.size()) fields[count] = trimmed(rest.substr(0, comma));
-      if (comma == std::string_view::npos) break;
-      rest.remove_prefix(comma + 1);
-    }
-    ++count;
-    if (count != fields.size()) {
-      refuse("", "has " + std::to_string(count) + " fields, expected 6: " + std::string(kHeader));
+    const std::vector<std::string_view> fields = fieldsOf(line);
+    if (fields.size() != kColumns.size()) {
+      refuse("", "has " + std::to_string(fields.size()) +
+                     " fields, expected 6: " + std::string(kHeader));
     }
     if (fields[0].empty()) refuse(kColumns[0], "is empty, expected the name of a view");
     if (fields[0].size() > kLongestName) refuse(kColumns[0], "is longer than 4096 characters");

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <numeric>
 
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
@@ -86,6 +87,42 @@ std::size_t FitInput::cornerCount() const {
   return count;
 }
 
+int FitInput::poseCount() const {
+  return pose.empty() ? 0 : 1 + *std::max_element(pose.begin(), pose.end());
+}
+
+BundleOptions FitInput::freedom() const {
+  BundleOptions options;
+  options.warp = warp;
+  options.axis = stage;
+  return options;
+}
+
+FitInput FitInput::subset(const std::vector<bool>& keep) const {
+  FitInput kept = *this;
+  kept.names.clear();
+  kept.index.clear();
+  kept.corners.clear();
+  kept.pose.clear();
+  kept.travel.clear();
+  for (std::size_t i = 0; i < corners.size(); ++i) {
+    if (!keep[i]) continue;
+    kept.names.push_back(names[i]);
+    kept.index.push_back(index[i]);
+    kept.corners.push_back(corners[i]);
+    kept.pose.push_back(pose[i]);
+    kept.travel.push_back(travel[i]);
+  }
+  return kept;
+}
+
+void FitInput::separate() {
+  stage = false;
+  pose.resize(corners.size());
+  std::iota(pose.begin(), pose.end(), 0);
+  travel.assign(corners.size(), 0.0);
+}
+
 ResidualStatistics statisticsOf(const std::vector<std::vector<Eigen::Vector2d>>& residuals) {
   std::vector<double> lengths;
   double squares = 0.0;
@@ -118,11 +155,12 @@ void checkStructure(const LensStructure& structure) {
   makeLens(structure, Eigen::Vector2d(500.0, 500.0), 300.0, 1.0);
 }
 
-std::vector<BundleView> bundleViews(const std::vector<std::vector<Corner>>& corners) {
-  std::vector<BundleView> views(corners.size());
-  for (std::size_t i = 0; i < corners.size(); ++i) {
-    views[i].corners = &corners[i];
-    views[i].pose = static_cast<int>(i);
+std::vector<BundleView> bundleViews(const FitInput& input) {
+  std::vector<BundleView> views(input.corners.size());
+  for (std::size_t i = 0; i < views.size(); ++i) {
+    views[i].corners = &input.corners[i];
+    views[i].pose = input.pose[i];
+    views[i].travel = input.travel[i];
   }
   return views;
 }
@@ -131,7 +169,7 @@ std::vector<std::vector<Eigen::Vector2d>> residualsOf(const FitInput& input,
                                                       const BundleState& state) {
   std::vector<std::vector<Eigen::Vector2d>> residuals;
   residuals.reserve(input.corners.size());
-  for (const BundleView& view : bundleViews(input.corners)) {
+  for (const BundleView& view : bundleViews(input)) {
     residuals.push_back(residualsOf(view, state));
   }
   return residuals;
@@ -164,7 +202,7 @@ LensPtr withField(const LensPtr& lens, double max_theta) {
 double outermostAngle(const FitInput& input, const BundleState& state, double sigma_px) {
   const double limit = std::max(5.0 * sigma_px, 0.05);
   double outermost = 0.0;
-  for (const BundleView& view : bundleViews(input.corners)) {
+  for (const BundleView& view : bundleViews(input)) {
     const auto residuals = residualsOf(view, state);
     for (std::size_t i = 0; i < residuals.size(); ++i) {
       if (residuals[i].norm() > limit) continue;
@@ -179,7 +217,7 @@ std::optional<Fit> firstFit(const FitInput& input, int threads, std::vector<bool
   const Eigen::Vector2d center(0.5 * (input.image_size.width - 1),
                                0.5 * (input.image_size.height - 1));
   const double good_px = 1e-3 * std::hypot(input.image_size.width, input.image_size.height);
-  const auto views = bundleViews(input.corners);
+  const auto views = bundleViews(input);
   std::optional<Fit> best;
   for (const Start& start : findStarts(input.corners, input.image_size, threads)) {
     Fit fit;
@@ -284,11 +322,14 @@ std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStruc
   lens = fitLens(*lens, bearings, pixels).lens;
   fit.state.lenses = {lens};
 
-  const auto views = bundleViews(input.corners);
-  BundleOptions options;
-  options.warp = input.warp;
+  const auto views = bundleViews(input);
+  BundleOptions options = input.freedom();
   // A poorer structure than the one before explains less: start with the loss it deserves.
-  for (const BundleView& view : views) refinePose({view}, 0.0, fit.state, 3);
+  std::vector<std::vector<BundleView>> sights(fit.state.poses.size());
+  for (const BundleView& view : views) sights[view.pose].push_back(view);
+  for (const auto& sight : sights) {
+    if (!sight.empty()) refinePose(sight, 0.0, fit.state, 3);
+  }
   fit.sigma_px = std::max(from.sigma_px, statisticsOf(residualsOf(input, fit.state)).sigma_px);
   if (!settle(input, views, options, fit)) return std::nullopt;
   const double reached =
@@ -298,7 +339,7 @@ std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStruc
 }
 
 std::optional<double> holdoutRms(const FitInput& input, const Fit& fit, int folds, int threads) {
-  const auto views = bundleViews(input.corners);
+  const auto views = bundleViews(input);
   struct Sum {
     double squares = 0.0;
     std::size_t count = 0;
@@ -315,8 +356,7 @@ std::optional<double> holdoutRms(const FitInput& input, const Fit& fit, int fold
     }
     if (unseen.empty()) return;
     BundleState state = fit.state;
-    BundleOptions options;
-    options.warp = input.warp;
+    BundleOptions options = input.freedom();
     options.loss_px = fit.loss_px;
     options.tolerance = 1e-8;
     if (known.size() < 3 || !adjust(known, options, state)) {

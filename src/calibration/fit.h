@@ -21,14 +21,26 @@ struct FitInput {
   std::vector<std::string> names;
   std::vector<int> index;  ///< place in the detections: view i is in fold i mod K
   std::vector<std::vector<Corner>> corners;
+  /// Which of BundleState::poses each view has, and the stage's position less that of the first
+  /// view on a stage. Without a stage every view has its own pose.
+  std::vector<int> pose;
+  std::vector<double> travel;
+  bool stage = false;  ///< some views share poses: BundleState::axis is estimated
   bool warp = true;
 
   std::size_t cornerCount() const;
+  int poseCount() const;
+  /// What an adjustment of the lens is to free.
+  BundleOptions freedom() const;
+  /// The views that `keep` marks. Poses keep their numbers.
+  FitInput subset(const std::vector<bool>& keep) const;
+  /// Every view with a pose of its own and no stage.
+  void separate();
 };
 
 struct Fit {
   LensStructure structure;
-  BundleState state;      ///< one lens; pose i belongs to view i of the input
+  BundleState state;      ///< one lens; poses as FitInput::pose says
   double sigma_px = 0.0;  ///< robust standard deviation of one coordinate of a residual [px]
   double loss_px = 0.0;   ///< scale of the loss at the end [px]
 };
@@ -47,7 +59,7 @@ std::string describeStructure(const LensStructure& structure);
 /// Throws Error for a structure that no lens can have.
 void checkStructure(const LensStructure& structure);
 
-std::vector<BundleView> bundleViews(const std::vector<std::vector<Corner>>& corners);
+std::vector<BundleView> bundleViews(const FitInput& input);
 
 std::vector<std::vector<Eigen::Vector2d>> residualsOf(const FitInput& input,
                                                       const BundleState& state);

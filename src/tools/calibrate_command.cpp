@@ -1,11 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 // `calibrate`: one camera's lens from images of a board or from corners found elsewhere.
 #include <chrono>
+#include <cmath>
 #include <memory>
 
 #include "calibration_arguments.h"
 #include "calibration_report.h"
+#include "omnister/calibration/stage_positions.h"
 #include "omnister/common/error.h"
+#include "omnister/common/numbers.h"
 #include "procedure_command.h"
 
 namespace omnister::tools {
@@ -16,6 +19,7 @@ struct Arguments {
   ProcedureArguments procedure;
   std::vector<std::string> images;
   std::string detections_file;
+  std::string positions_file;
   std::string out;
   bool* json = nullptr;
 };
@@ -25,9 +29,18 @@ void run(const Arguments& arguments) {
   std::vector<std::string> inputs = arguments.images;
   inputs.push_back(arguments.detections_file);
   inputs.push_back(arguments.common.target_file);
+  inputs.push_back(arguments.positions_file);
   checkOutputs(inputs, {arguments.out});
-  const Detections detections =
+  std::vector<StageView> positions;
+  if (!arguments.positions_file.empty()) positions = readStagePositions(arguments.positions_file);
+  Detections detections =
       gatherDetections(arguments.common, arguments.images, arguments.detections_file, false);
+  if (!positions.empty()) {
+    for (const std::string& remark :
+         applyStagePositions(positions, arguments.positions_file, detections)) {
+      say("warning: " + printable(remark, 1000));
+    }
+  }
   const CalibrationResult result = calibrate(detections, calibrationOptions(arguments.common));
   for (const std::string& warning : result.warnings) say("warning: " + printable(warning, 1000));
 
@@ -41,6 +54,18 @@ void run(const Arguments& arguments) {
   // Images without a board are views too.
   if (!arguments.images.empty()) json["views"] = arguments.images.size();
   json["max_theta_rad"] = result.file.lens->maxTheta();
+  json["height_px"] = result.height_px;
+  json["height_sigma_px"] = nullptr;
+  if (std::isfinite(result.height_sigma_px)) json["height_sigma_px"] = result.height_sigma_px;
+  if (result.stage) {
+    const StageResult& stage = *result.stage;
+    json["stage_axis"] = {stage.axis.x(), stage.axis.y(), stage.axis.z()};
+    json["stage_axis_sigma_rad"] = stage.axis_sigma_rad;
+    json["stage_scale"] = stage.scale;
+    json["stage_scale_sigma"] = stage.scale_sigma;
+    json["stage_boards"] = stage.boards;
+    json["stage_views"] = stage.views;
+  }
   json["warnings"] = result.warnings;
   if (!arguments.common.report_folder.empty()) {
     const std::string html = calibrationReport("Lens calibration", detections, result);
@@ -63,6 +88,9 @@ void addCalibrate(CLI::App& app) {
   command->add_option(
       "--detections", arguments->detections_file,
       "Corners as CSV: view,u_px,v_px,x_m,y_m,z_m (with --size, instead of images)");
+  command->add_option("--positions", arguments->positions_file,
+                      "Stage positions as CSV: view,position_m[,board]. Views of one board share "
+                      "its pose, the steps are lengths, and the stage's axis is found");
   command->add_option("--out", arguments->out, "Lens file to write");
   arguments->json = &addJsonFlag(*command);
   command->callback([arguments, command] {
@@ -83,6 +111,9 @@ void addCalibrate(CLI::App& app) {
         if (command->count(option) > 0) throw CLI::RequiresError(option, "--procedure");
       }
       return run(*arguments);
+    }
+    if (!arguments->positions_file.empty()) {
+      throw CLI::ExcludesError("--positions", "--procedure");
     }
     runProcedure(procedure, arguments->common, arguments->images, arguments->detections_file,
                  arguments->out, *arguments->json);

@@ -43,6 +43,18 @@ struct CandidateResult {
   bool chosen = false;
 };
 
+/// What views at known stage positions say of the stage.
+struct StageResult {
+  Eigen::Vector3d axis = Eigen::Vector3d::UnitX();  ///< way of the camera for growing positions,
+                                                    ///< unit vector in the optical frame
+  double axis_sigma_rad = 0.0;                      ///< standard deviation of its direction [rad]
+  /// Length of the stage's metre by the board's, were it free: 1 where both are right.
+  double scale = 1.0;
+  double scale_sigma = 0.0;
+  int boards = 0;  ///< placements of the board seen from more than one position
+  int views = 0;   ///< views of these
+};
+
 struct CalibrationResult {
   LensFile file;                               ///< lens, covariance and record, ready to write
   Eigen::Vector2d board_warp = Eigen::Vector2d::Zero();  ///< see calibrate()
@@ -51,11 +63,15 @@ struct CalibrationResult {
   double rms_px = 0.0;                         ///< over all corners of used views, 2-D error per corner
   std::optional<double> holdout_rms_px;
   int points = 0;
+  double height_px = 0.0;        ///< of the surface over its centre, Johnson's R0: pixels per radian there
+  double height_sigma_px = 0.0;  ///< its standard deviation; NaN where it cannot be told
+  std::optional<StageResult> stage;            ///< where views had stage positions
   std::vector<std::string> warnings;           ///< for a person: bad images by name, poor coverage, …
 };
 
 /// Joint adjustment of lens, poses and board warp with a robust loss, started from bearings without a
-/// focal guess.
+/// focal guess. Views with a stage position share the pose of their board, moved by the known steps
+/// along an axis that is estimated too; lengths of board and stage are then of one unit.
 /// @throws Error with the reason where the data cannot carry a calibration (too few views, boards only
 /// square to the axis, …). Never returns a failed fit.
 CalibrationResult calibrate(const Detections& detections, const CalibrationOptions& options);

@@ -6,17 +6,25 @@
 #include <Eigen/Core>
 #include <filesystem>
 #include <opencv2/core/types.hpp>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
 
 namespace omnister {
 
+/// Where a stage held the camera while it saw a view.
+struct StagePosition {
+  double position_m = 0.0;  ///< along the stage's axis, in the board's unit of length
+  std::string board{};      ///< views of one name share one pose of the board
+};
+
 /// One image's corners.
 struct ViewDetections {
-  std::string name;                        ///< image file or CSV view id, for reports
-  std::vector<Eigen::Vector2d> pixels;     ///< [px]
-  std::vector<Eigen::Vector3d> points;     ///< on the board, in the board's unit of length, same order
+  std::string name{};                       ///< image file or CSV view id, for reports
+  std::vector<Eigen::Vector2d> pixels{};    ///< [px]
+  std::vector<Eigen::Vector3d> points{};    ///< on the board, in the board's unit of length, same order
+  std::optional<StagePosition> stage{};     ///< empty: the board may be anywhere
 };
 
 /// All views of one camera, in order of first appearance.
