@@ -463,7 +463,6 @@ void ConcludeRow(ConcludeJob* in_out) {
     return hn::ConvertTo(df, hn::PromoteTo(di, hn::LoadU(du16, p)));
   };
   HWY_ALIGN std::int32_t words[HWY_MAX_BYTES / 4];
-  auto first = hn::Set(di, job.claim_first), last = hn::Set(di, job.claim_last);
   for (int x = 0; x < job.count; x += lanes) {
     const auto c = load(job.cost + x), before = load(job.before + x), after = load(job.after + x);
     const auto k = hn::PromoteTo(di, hn::LoadU(di16, job.index + x));
@@ -482,6 +481,8 @@ void ConcludeRow(ConcludeJob* in_out) {
       good = hn::And(good, hn::And(legal, hn::Eq(bit, hn::Set(di, 1))));
     }
     auto fine = hn::And(hn::RebindMask(df, good), hn::Gt(steep, hn::Zero(df)));
+    // The least at the end of an interval is the foot of one beyond it.
+    fine = hn::And(fine, hn::And(hn::Ge(before, c), hn::Ge(after, c)));
     fine = hn::And(fine, hn::Le(c, hn::Set(df, job.worst_cost)));
     // The pixels of a window fall between columns, each elsewhere: their sum is rounder than two
     // lines and sharper than a parabola. With this gain a shift of all columns leaves no bias.
@@ -515,39 +516,103 @@ void ConcludeRow(ConcludeJob* in_out) {
       const auto counted =
           hn::And(hn::RebindMask(di, fine), hn::Lt(hn::Iota(di, x), hn::Set(di, job.count)));
       hn::StoreU(hn::IfThenElse(counted, at, hn::Set(di, -1)), di, job.claim + x);
-      const auto units = hn::NearestInt(
-          hn::Add(hn::Mul(h, hn::Set(df, job.claim_units)), hn::Set(df, kClaimOffset)));
-      const auto low = hn::Min(hn::Max(units, hn::Zero(di)), hn::Set(di, 0x7FFF));
-      hn::StoreU(hn::Or(hn::ShiftLeft<16>(hn::ConvertTo(di, c)), low), di, job.value + x);
-      first = hn::Min(first, hn::IfThenElse(counted, row, first));
-      last = hn::Max(last, hn::IfThenElse(counted, row, last));
     }
   }
-  job.claim_first = hn::GetLane(hn::MinOfLanes(di, first));
-  job.claim_last = hn::GetLane(hn::MaxOfLanes(di, last));
 }
 
-std::size_t CheckRow(const std::int32_t* claims, const std::int32_t* claim,
-                     const std::int32_t* value, int tolerance, float* h, int count) {
+/// Where pixels claim, and with what hypothesis.
+template <class DI>
+HWY_INLINE void Claim(DI di, const ClaimJob& job, int x, hn::Vec<DI>* at, hn::Vec<DI>* units) {
+  const hn::RebindToFloat<DI> df;
+  const auto claim = hn::LoadU(di, job.claim + x);
+  const auto made =
+      hn::And(hn::Gt(claim, hn::Set(di, -1)), hn::Lt(hn::Iota(di, x), hn::Set(di, job.count)));
+  // Those that claim nothing go each to an element of its own, so that none waits.
+  *at = hn::IfThenElse(made, claim, hn::Iota(di, job.none));
+  // An offset, so that small negative hypotheses can be told.
+  const auto counted = hn::NearestInt(
+      hn::Add(hn::Mul(hn::LoadU(df, job.h + x), hn::Set(df, job.units)), hn::Set(df, 64.0f)));
+  *units = hn::Min(hn::Max(counted, hn::Zero(di)), hn::Set(di, 0x7FFF));
+}
+
+void ClaimRow(const ClaimJob& job) {
+  const hn::ScalableTag<std::int32_t> di;
+  const hn::Rebind<std::uint16_t, decltype(di)> du16;
+  const int lanes = static_cast<int>(hn::Lanes(di));
+  HWY_ALIGN std::int32_t at[HWY_MAX_BYTES / 4], value[HWY_MAX_BYTES / 4];
+  std::int32_t* HWY_RESTRICT claims = job.claims;
+  for (int x = 0; x < job.count; x += lanes) {
+    hn::Vec<decltype(di)> element, units;
+    Claim(di, job, x, &element, &units);
+    const auto cost = hn::PromoteTo(di, hn::LoadU(du16, job.cost + x));
+    hn::Store(element, di, at);
+    hn::Store(hn::Or(hn::ShiftLeft<16>(cost), units), di, value);
+    for (int i = 0; i < lanes; ++i) claims[at[i]] = std::min(claims[at[i]], value[i]);
+  }
+}
+
+void RejectRow(RejectJob* in_out) {
+  RejectJob& job = *in_out;
   const hn::ScalableTag<float> df;
   const hn::RebindToSigned<decltype(df)> di;
+  const hn::Rebind<std::uint16_t, decltype(df)> du16;
   const int lanes = static_cast<int>(hn::Lanes(df));
-  HWY_ALIGN std::int32_t found[HWY_MAX_BYTES / 4];
-  std::size_t gone = 0;
+  constexpr int kReach = RejectJob::kReach;
+  const int count = job.claimed.count;
+  const auto jump = hn::Set(df, job.jump);
+  const auto cost = [&](int row, int x) {
+    return hn::PromoteTo(di, hn::LoadU(du16, job.cost[row] + x));
+  };
+  const std::int32_t* HWY_RESTRICT claims = job.claimed.claims;
+  HWY_ALIGN std::int32_t at[HWY_MAX_BYTES / 4];
   for (int x = 0; x < count; x += lanes) {
-    const auto at = hn::LoadU(di, claim + x);
-    hn::Store(hn::Max(at, hn::Zero(di)), di, found);
-    for (int i = 0; i < lanes; ++i) found[i] = claims[found[i]];
-    const auto low = hn::Set(di, 0xFFFF);
-    const auto theirs = hn::And(hn::Load(di, found), low);
-    const auto mine = hn::And(hn::LoadU(di, value + x), low);
-    const auto lost = hn::And(hn::Gt(at, hn::Set(di, -1)),
-                              hn::Gt(hn::Abs(hn::Sub(mine, theirs)), hn::Set(di, tolerance)));
-    const auto lost_f = hn::RebindMask(df, lost);
-    hn::StoreU(hn::IfThenElse(lost_f, hn::NaN(df), hn::LoadU(df, h + x)), df, h + x);
-    gone += hn::CountTrue(df, lost_f);
+    const auto h = hn::LoadU(df, job.h[1] + x);
+    const auto known =
+        hn::And(hn::RebindMask(df, hn::Lt(hn::Iota(di, x), hn::Set(di, count))), hn::Eq(h, h));
+    hn::Vec<decltype(di)> element, mine;
+    Claim(di, job.claimed, x, &element, &mine);
+    hn::Store(element, di, at);
+    for (int i = 0; i < lanes; ++i) at[i] = claims[at[i]];
+    const auto theirs = hn::And(hn::Load(di, at), hn::Set(di, 0xFFFF));
+    const auto apart = hn::Gt(hn::Abs(hn::Sub(theirs, mine)), hn::Set(di, job.tolerance));
+    const auto lost = hn::And(known, hn::RebindMask(df, apart));
+
+    const auto side = [&](int row, int dx) { return hn::LoadU(df, job.h[row] + x + dx); };
+    const auto up = side(0, 0), down = side(2, 0);
+    const auto left = side(1, -kReach), right = side(1, kReach);
+    // Comparisons with NaN are false.
+    const auto beyond = [&](decltype(h) other) { return hn::Gt(hn::Sub(h, other), jump); };
+    auto edge = hn::Or(hn::Or(beyond(up), beyond(down)), hn::Or(beyond(left), beyond(right)));
+    if (!hn::AllFalse(df, edge)) {
+      // More than 1.3 times and another kMore.
+      constexpr int kMore = 40;
+      const auto own = hn::Mul(hn::Sub(cost(1, x), hn::Set(di, kMore)), hn::Set(di, 10));
+      const auto dear = [&](decltype(h) outside, decltype(h) inside, int row, int dx) {
+        const auto same = hn::Lt(hn::Abs(hn::Sub(inside, h)), jump);
+        const auto more = hn::Gt(own, hn::Mul(cost(row, x + dx), hn::Set(di, 13)));
+        return hn::And(hn::And(beyond(outside), same), hn::RebindMask(df, more));
+      };
+      edge = hn::Or(hn::Or(dear(up, down, 2, 0), dear(down, up, 0, 0)),
+                    hn::Or(dear(left, right, 1, kReach), dear(right, left, 1, -kReach)));
+    }
+    edge = hn::AndNot(lost, hn::And(known, edge));
+    hn::StoreU(hn::IfThenElse(hn::Or(lost, edge), hn::NaN(df), h), df, job.out + x);
+    job.found += hn::CountTrue(df, known);
+    job.lost += hn::CountTrue(df, lost);
+    job.edge += hn::CountTrue(df, edge);
   }
-  return gone;
+}
+
+/// Stores the first `count` lanes, for rows that end where another begins.
+template <class D>
+HWY_INLINE void StoreFront(D d, hn::Vec<D> v, float* to, int count) {
+  if (count >= static_cast<int>(hn::Lanes(d))) {
+    hn::StoreU(v, d, to);
+  } else {
+    HWY_ALIGN float last[HWY_MAX_BYTES / sizeof(float)];
+    hn::Store(v, d, last);
+    std::copy(last, last + count, to);
+  }
 }
 
 void MedianRow(const float* const rows[3], int count, float* HWY_RESTRICT out) {
@@ -585,7 +650,7 @@ void MedianRow(const float* const rows[3], int count, float* HWY_RESTRICT out) {
     sort(f, c);
     f = hn::Max(i, f);
     f = hn::Min(f, c);
-    hn::StoreU(hn::IfThenElse(hn::IsNaN(middle), middle, f), d, out + x);
+    StoreFront(d, hn::IfThenElse(hn::IsNaN(middle), middle, f), out + x, count - x);
   }
 }
 
@@ -600,9 +665,13 @@ void TriangulateRow(TriangulateJob* job) {
   const auto nan = hn::NaN(d);
   for (int x = 0; x < job->count; x += lanes) {
     const auto in = hn::RebindMask(d, hn::Lt(hn::Iota(di, x), hn::Set(di, job->count)));
-    const auto h = hn::LoadU(d, job->h + x), a = hn::LoadU(d, job->a + x);
+    HWY_ALIGN float ends[HWY_MAX_BYTES / sizeof(float)] = {};
+    const bool whole = x + lanes <= job->count;
+    if (!whole) std::copy(job->h + x, job->h + job->count, ends);
+    const auto h = whole ? hn::LoadU(d, job->h + x) : hn::Load(d, ends);
+    const auto a = hn::LoadU(d, job->a + x);
     const auto known = hn::And(in, hn::Not(hn::IsNaN(h)));
-    const auto cost = hn::ConvertTo(d, hn::ShiftRight<16>(hn::LoadU(di, job->value + x)));
+    const auto cost = load(job->cost + x);
     const auto steep = hn::Max(load(job->steep + x), hn::Set(d, 1.0f));
     const auto one = hn::Set(d, 1.0f);
     // Spread of the least: noise of the costs over the slope beside it.
@@ -634,14 +703,7 @@ void TriangulateRow(TriangulateJob* job) {
         hn::Max(hn::Sub(one, hn::Mul(cost, hn::Set(d, 1.0f / job->full_cost))), hn::Zero(d)),
         hn::Min(hn::Mul(steep, hn::Set(d, 1.0f / 60.0f)), one));
     const auto put = [&](float* to, decltype(range) value) {
-      const auto v = hn::IfThenElse(valid, value, nan);
-      if (x + lanes <= job->count) {
-        hn::StoreU(v, d, to + x);
-      } else {
-        HWY_ALIGN float last[HWY_MAX_BYTES / sizeof(float)];
-        hn::Store(v, d, last);
-        std::copy(last, last + (job->count - x), to + x);
-      }
+      StoreFront(d, hn::IfThenElse(valid, value, nan), to + x, job->count - x);
     };
     put(job->range, range);
     put(job->sigma, sigma);
@@ -670,7 +732,8 @@ HWY_EXPORT(CensusBlock);
 HWY_EXPORT(MatchChunk);
 HWY_EXPORT(TriangulateRow);
 HWY_EXPORT(MedianRow);
-HWY_EXPORT(CheckRow);
+HWY_EXPORT(ClaimRow);
+HWY_EXPORT(RejectRow);
 HWY_EXPORT(ConcludeRow);
 HWY_EXPORT(MapRow);
 HWY_EXPORT(BoxMeanRow);
@@ -725,10 +788,9 @@ void boxMeanRow(const float* in, int stride, int count, float* line, float* out)
 
 void concludeRow(ConcludeJob* job) { HWY_DYNAMIC_DISPATCH(ConcludeRow)(job); }
 
-std::size_t checkRow(const std::int32_t* claims, const std::int32_t* claim,
-                     const std::int32_t* value, int tolerance, float* h, int count) {
-  return HWY_DYNAMIC_DISPATCH(CheckRow)(claims, claim, value, tolerance, h, count);
-}
+void claimRow(const ClaimJob& job) { HWY_DYNAMIC_DISPATCH(ClaimRow)(job); }
+
+void rejectRow(RejectJob* job) { HWY_DYNAMIC_DISPATCH(RejectRow)(job); }
 
 void medianRow(const float* const rows[3], int count, float* out) {
   HWY_DYNAMIC_DISPATCH(MedianRow)(rows, count, out);

@@ -134,19 +134,39 @@ struct ConcludeJob {
   float claim_x = 0, claim_y = 0, claim_y_offset = 0;
   int claim_width = 0, claim_height = 0;
   std::int32_t* claim = nullptr;  ///< [out] -1 where nothing was found
-  float claim_units = 0;          ///< claims count hypotheses in units of 1 / claim_units
-  std::int32_t* value = nullptr;  ///< [out] what is claimed: cost << 16 | hypothesis
-  std::int32_t claim_first = INT32_MAX, claim_last = -1;  ///< [in, out] rows of it, widened
 };
 void concludeRow(ConcludeJob* job);
 
-/// Makes NaN of hypotheses whose claim went to another that differs by more than `tolerance` units.
-/// @return how many
-std::size_t checkRow(const std::int32_t* claims, const std::int32_t* claim,
-                     const std::int32_t* value, int tolerance, float* h, int count);
+/// Matches that claim spots of the displaced image: every spot goes to the least cost.
+struct ClaimJob {
+  int count = 0;
+  const std::int32_t* claim = nullptr;  ///< of concludeRow()
+  const float* h = nullptr;
+  const std::uint16_t* cost = nullptr;
+  float units = 0;                 ///< hypotheses are kept in units of 1 / units
+  std::int32_t* claims = nullptr;  ///< cost << 16 | hypothesis; kClaimSlack elements more
+  std::int32_t none = 0;           ///< of them, for what claims nothing
+};
+/// Elements behind the claims that may be written.
+inline constexpr int kClaimSlack = 64;
+void claimRow(const ClaimJob& job);
 
-/// Added to a hypothesis in a claim, so that small negative ones can be told.
-inline constexpr float kClaimOffset = 64.0f;
+/// What is not to be believed by the look of others.
+struct RejectJob {
+  static constexpr int kReach = 3;  ///< pixels up, down, left and right to neighbours
+  ClaimJob claimed;                 ///< of row y, all claims made
+  int tolerance = 0;                ///< units that two claims on one spot may differ by
+  const float* h[3] = {};           ///< rows y - kReach, y, y + kReach
+  /// The same; kReach elements before and behind must be readable.
+  const std::uint16_t* cost[3] = {};
+  float jump = 0;        ///< hypotheses that differ by more lie on two surfaces
+  float* out = nullptr;  ///< h, with NaN for what goes
+  std::size_t found = 0, lost = 0, edge = 0;  ///< counted up: matches, and those that went
+};
+/// Leaves out matches whose spot went to another hypothesis; and at the edge of a nearer surface
+/// those that cost much more than that surface does further in: they lie beyond the edge, in the
+/// reach of windows across it.
+void rejectRow(RejectJob* job);
 
 /// Median of 3x3 where the middle is valid, neighbours that are not counting as the middle.
 /// @param rows above, here, below; one element before and behind must be readable
@@ -157,8 +177,8 @@ struct TriangulateJob {
   bool inverse = false;  ///< h is 1 / rho, else the parallax angle
   float baseline = 0;    ///< [m]
   const float* a = nullptr;
-  const float* h = nullptr;
-  const std::int32_t* value = nullptr;  ///< of concludeRow()
+  const float* h = nullptr;  ///< may be where range will be
+  const std::uint16_t* cost = nullptr;
   const std::uint16_t* steep = nullptr;
   float step_h = 0;
   float min_range = 0, max_range = 0;

@@ -9,6 +9,8 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <tuple>
+#include <utility>
 
 #include "multi_position.h"
 #include "omnister/common/error.h"
@@ -28,13 +30,23 @@ constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 constexpr float kFullCost = kWindow * kWindow * kBits;  ///< every bit of every descriptor wrong
 constexpr int kTileWidth = 64, kTileHeight = 48;
-constexpr float kMiddleX = 32, kMiddleY = 24;  ///< where planes are fitted about
-constexpr int kNarrowLanes = 14;               ///< hypotheses of the cheapest chunk
-constexpr int kSearchMargin = 3;               ///< columns beyond what the coarser level found
-constexpr int kClaimTolerance = 6;    ///< quarters of a column that two claims may differ by
+constexpr float kMiddleX = 32, kMiddleY = 24;   ///< where planes are fitted about
+constexpr int kNarrowLanes = 14;                ///< hypotheses of the cheapest chunk
+constexpr int kSearchMargin = 3;                ///< columns beyond what the coarser level found
+constexpr int kMostPlanes = 3;                  ///< of a tile
+constexpr int kNeeded = 4, kNeededShare = 200;  ///< samples that make the search go somewhere
+constexpr float kOnPlane = 3.4f;                ///< columns off a plane that still belong to it,
+constexpr float kFarOff = 16;                   ///< or are looked for from it
+constexpr int kBeyond = 8;                      ///< pixels around where a plane was seen
+constexpr float kSteepest = 1.2f;               ///< columns a pixel that a plane may rise
+constexpr float kClaimUnits = 4;                ///< of a column, in which claims are compared;
+constexpr int kClaimTolerance = 7;              ///< so many of these two may differ by
+constexpr float kClaimScale = 0.5f;             ///< spots a column of the claims image
+constexpr std::int32_t kUnclaimed = std::numeric_limits<std::int32_t>::max();
+constexpr float kEdgeJump = 1.5f;     ///< columns between surfaces at an edge
 constexpr int kSpeckle = 100;         ///< regions of fewer pixels go,
 constexpr int kSpeckleShare = 3000;   ///< or of less than this part of the image
-constexpr float kWorstShare = 0.36f;  ///< of it, that a match may cost; chance gives a half
+constexpr float kWorstShare = 0.34f;  ///< of it, that a match may cost; chance gives a half
 
 class Stopwatch {
  public:
@@ -61,11 +73,19 @@ struct Level {
   cv::Mat h;      ///< CV_32FC1, hypotheses found
 };
 
-/// What the next coarser level says of a tile: a plane of hypotheses through it, and how far from
-/// the plane to look. All in columns; the plane by pixels from the tile's corner.
+/// A surface that the next coarser level saw in a tile: a plane of hypotheses, and how far from it
+/// to look. All in columns; the plane by pixels from the tile's corner.
 struct Guess {
   float at = 0, x = 0, y = 0;
   std::vector<std::pair<int, int>> intervals;
+  cv::Rect where;  ///< part of the tile that it was seen in
+
+  float operator()(float u, float v) const { return at + x * u + y * v; }
+};
+
+/// A pixel of the coarser level: where it is in the tile, and its hypothesis in columns.
+struct Sample {
+  float x, y, columns;
 };
 
 /// What a thread keeps between tiles.
@@ -78,14 +98,22 @@ struct Scratch {
   std::vector<std::uint16_t> cost, before, after;
   std::vector<std::int16_t> index;
   std::vector<int> histogram;
-  std::vector<Eigen::Vector3f> samples;
-  Guess guess;
+  std::vector<Sample> samples, others;
+  std::vector<std::uint8_t> owner;
+  std::vector<Guess> guesses;
+  // Of the passes before, and one row of this one.
+  std::vector<std::uint16_t> best_cost, row_steep;
+  std::vector<float> row_h;
+  std::vector<std::int32_t> row_claim;
+  std::vector<std::int32_t> claims;     ///< of this thread's tiles
+  std::vector<float> rows[3], nothing;  ///< between two filters
 };
 
-/// A plane of one value a pixel; vector code may write up to 64 elements behind the end of a row.
-cv::Mat makePlane(cv::Size size, int type) {
-  const cv::Mat room(size.height, (size.width + 63) / 64 * 64 + 64, type, cv::Scalar(-1));
-  return room.colRange(0, size.width);
+/// A plane of one value a pixel; vector code may read 16 elements before a row, and write up to 64
+/// behind it.
+cv::Mat makePlane(cv::Size size, int type, double value = -1) {
+  const cv::Mat room(size.height, (size.width + 63) / 64 * 64 + 80, type, cv::Scalar(value));
+  return room.colRange(16, 16 + size.width);
 }
 
 class SweepMatcher : public SweepPair {
@@ -129,7 +157,7 @@ class SweepMatcher : public SweepPair {
       const cv::Size r = reduced(geometry.reference_size), d = reduced(displaced.size);
       level.reference.create(r.width, r.height);
       level.displaced.create(d.width, d.height);
-      level.h = makePlane(r, CV_32FC1);
+      level.h = makePlane(r, CV_32FC1, kNaN);
     }
     prepareClaims();
   }
@@ -137,6 +165,7 @@ class SweepMatcher : public SweepPair {
   MatchResult match(const cv::Mat& reference, const std::vector<cv::Mat>& displaced) override {
     checkImages(geometry_, reference, displaced);
     const auto start = std::chrono::steady_clock::now();
+    for (Scratch& scratch : scratch_) scratch.claims.clear();
     MatchResult result;
     Stopwatch watch(&result.statistics.seconds);
     makePyramid(reference, &Level::reference);
@@ -191,12 +220,9 @@ class SweepMatcher : public SweepPair {
   void prepareClaims() {
     const Level& level = levels_.front();
     const cv::Size size = level.map.size;
-    value_ = makePlane(size, CV_32SC1);
+    cost_ = makePlane(size, CV_16UC1);
     steep_ = makePlane(size, CV_16UC1);
     claim_ = makePlane(size, CV_32SC1);
-    // Claims are done with when smoothing begins.
-    smooth_ = cv::Mat(size, CV_32FC1, claim_.data, claim_.step);
-    claim_rows_.assign(level.layout.tiles.size(), {1, 0});
     finest_step_ = std::numeric_limits<float>::max();
     for (const Band& band : level.grid.bands)
       finest_step_ = std::min(finest_step_, static_cast<float>(band.step_h));
@@ -209,11 +235,10 @@ class SweepMatcher : public SweepPair {
       least = std::min(least, phi);
       most = std::max(most, phi);
     }
-    claim_x_ = 1 / finest_step_;
+    claim_x_ = kClaimScale / finest_step_;
     claim_y_offset_ = std::floor(least * claim_x_) - 4;
     claim_size_ = cv::Size(static_cast<int>(3.1416f * claim_x_) + 2,
                            static_cast<int>(most * claim_x_ - claim_y_offset_) + 8);
-    claims_.resize(static_cast<std::size_t>(claim_size_.area()));
   }
 
   void makePyramid(const cv::Mat& image, PaddedImage Level::*member) {
@@ -274,13 +299,14 @@ class SweepMatcher : public SweepPair {
     }
   }
 
+  /// Surfaces that the coarser level saw in and around a tile, each with its intervals.
   void guessTile(std::size_t l, const Tile& tile, const Band& band, Scratch* scratch) const {
-    Guess& guess = scratch->guess;
-    guess.at = guess.x = guess.y = 0;
+    std::vector<Guess>& guesses = scratch->guesses;
     const float to_columns = static_cast<float>(1 / band.step_h);
     const int least = static_cast<int>(std::floor(tile.h_min * to_columns)) - 1;
     const int most = static_cast<int>(std::ceil(tile.h_max * to_columns)) + 1;
-    guess.intervals.assign(1, {least, most});
+    const cv::Rect whole(0, 0, tile.rect.width, tile.rect.height);
+    guesses.assign(1, {0, 0, 0, {{least, most}}, whole});
     if (l + 1 == levels_.size()) return;
     const cv::Mat& coarse = levels_[l + 1].h;
     constexpr int kAround = 6;
@@ -288,75 +314,173 @@ class SweepMatcher : public SweepPair {
     const int y0 = std::max(tile.rect.y / 2 - kAround, 0);
     const int x1 = std::min(tile.rect.br().x / 2 + kAround, coarse.cols);
     const int y1 = std::min(tile.rect.br().y / 2 + kAround, coarse.rows);
-    std::vector<Eigen::Vector3f>& samples = scratch->samples;  // x, y, columns
+    std::vector<Sample>& samples = scratch->samples;
     samples.clear();
     int seen = 0;
     for (int y = y0; y < y1; y += 2) {
       const float* line = coarse.ptr<float>(y);
       for (int x = x0 + (y / 2 % 2); x < x1; x += 2) {
         ++seen;
-        if (!std::isnan(line[x])) {
-          samples.emplace_back(2 * x + 0.5f - tile.rect.x, 2 * y + 0.5f - tile.rect.y,
-                               line[x] * to_columns);
-        }
+        const float columns = line[x] * to_columns;
+        if (columns >= least - 2 && columns <= most + 2)  // neither NaN nor beyond
+          samples.push_back({2 * x + 0.5f - tile.rect.x, 2 * y + 0.5f - tile.rect.y, columns});
       }
     }
     if (static_cast<int>(samples.size()) * 8 < seen) return;
-    if (most - least > kNarrowLanes) fitPlane(samples, &guess);
-
     // A few stray pixels do not widen the search; a thin object does.
-    const float furthest = static_cast<float>(levels_[l].slack - 128);  // what may be read
-    std::vector<int>& histogram = scratch->histogram;
-    float low = furthest, high = -furthest;
-    for (Eigen::Vector3f& s : samples) {
-      s.z() -= guess.at + guess.x * s.x() + guess.y * s.y();
-      low = std::min(low, s.z());
-      high = std::max(high, s.z());
+    const int needed = std::max(kNeeded, static_cast<int>(samples.size()) / kNeededShare);
+    guesses.clear();
+    if (most - least > kNarrowLanes) findPlanes(needed, scratch);
+
+    // Every sample goes to the plane nearest to it, or to none; these are looked for one and all
+    // where they are.
+    const std::size_t planes = guesses.size();
+    std::vector<std::uint8_t>& owner = scratch->owner;
+    owner.resize(samples.size());
+    std::size_t strays = 0;
+    for (std::size_t i = 0; i < samples.size(); ++i) {
+      float nearest = kFarOff;
+      owner[i] = static_cast<std::uint8_t>(planes);
+      for (std::size_t p = 0; p < planes; ++p) {
+        const float off = std::fabs(samples[i].columns - guesses[p](samples[i].x, samples[i].y));
+        if (off > nearest) continue;
+        nearest = off;
+        owner[i] = static_cast<std::uint8_t>(p);
+      }
+      strays += owner[i] == planes;
     }
-    const int from = static_cast<int>(std::lround(std::max(low, -furthest)));
-    const int bins = static_cast<int>(std::lround(std::min(high, furthest))) - from + 1;
-    histogram.assign(bins + 2, 0);
-    for (const Eigen::Vector3f& s : samples)
-      ++histogram[1 + std::clamp(static_cast<int>(std::lround(s.z())) - from, 0, bins - 1)];
-    const int needed = std::max(2, static_cast<int>(samples.size()) / 400);
-    guess.intervals.clear();
-    for (int k = 1; k <= bins; ++k) {
-      if (histogram[k] == 0 || histogram[k - 1] + histogram[k] + histogram[k + 1] < needed)
-        continue;
-      const int first = from + k - 1 - kSearchMargin, last = from + k - 1 + kSearchMargin;
-      if (!guess.intervals.empty() && first <= guess.intervals.back().second + 4)
-        guess.intervals.back().second = last;
-      else
-        guess.intervals.emplace_back(first, last);
+    if (strays > 0) guesses.push_back({});
+    const float right = static_cast<float>(tile.rect.width - 1);
+    const float bottom = static_cast<float>(tile.rect.height - 1);
+    bool covered = false;
+    for (std::size_t p = 0; p < guesses.size(); ++p) {
+      Guess& guess = guesses[p];
+      const auto [low, high] =
+          std::minmax({guess(0, 0), guess(right, 0), guess(0, bottom), guess(right, bottom)});
+      const int from = least - static_cast<int>(std::ceil(high));
+      const int to = most - static_cast<int>(std::floor(low));
+      std::vector<int>& histogram = scratch->histogram;
+      histogram.assign(to - from + 3, 0);
+      const auto bin = [&](const Sample& s) {
+        const float off = s.columns - guess(s.x, s.y);
+        return 1 + std::clamp(static_cast<int>(std::lround(off)), from, to) - from;
+      };
+      for (std::size_t i = 0; i < samples.size(); ++i) {
+        if (owner[i] == p) ++histogram[bin(samples[i])];
+      }
+      for (int k = from; k <= to; ++k) {
+        const int* count = &histogram[1 + k - from];
+        if (count[0] == 0 || count[-1] + count[0] + count[1] < needed) continue;
+        const int first = std::max(k - kSearchMargin, from);
+        const int last = std::min(k + kSearchMargin, to);
+        if (!guess.intervals.empty() && first <= guess.intervals.back().second + 4)
+          guess.intervals.back().second = last;
+        else
+          guess.intervals.emplace_back(first, last);
+      }
+      // The first is looked for all over, so that every pixel is told something.
+      guess.where = whole;
+      if (guess.intervals.empty() || !std::exchange(covered, true)) continue;
+      float x_min = right, x_max = 0, y_min = bottom, y_max = 0;
+      for (std::size_t i = 0; i < samples.size(); ++i) {
+        const int* count = &histogram[owner[i] == p ? bin(samples[i]) : 1];
+        if (owner[i] != p || count[-1] + count[0] + count[1] < needed) continue;
+        x_min = std::min(x_min, samples[i].x);
+        x_max = std::max(x_max, samples[i].x);
+        y_min = std::min(y_min, samples[i].y);
+        y_max = std::max(y_max, samples[i].y);
+      }
+      const cv::Point corner(static_cast<int>(x_min) - kBeyond, static_cast<int>(y_min) - kBeyond);
+      const cv::Point end(static_cast<int>(x_max) + kBeyond, static_cast<int>(y_max) + kBeyond);
+      guess.where &= cv::Rect(corner, end);
     }
-    if (guess.intervals.empty()) {
-      guess.at = guess.x = guess.y = 0;
-      guess.intervals.assign(1, {least, most});
+    guesses.erase(std::remove_if(guesses.begin(), guesses.end(),
+                                 [](const Guess& guess) {
+                                   return guess.intervals.empty() || guess.where.empty();
+                                 }),
+                  guesses.end());
+    if (guesses.empty()) guesses.push_back({0, 0, 0, {{least, most}}, whole});
+  }
+
+  /// The planes that most samples lie on, one after the other.
+  static void findPlanes(int needed, Scratch* scratch) {
+    std::vector<Sample>& left = scratch->others;
+    left = scratch->samples;
+    for (int plane = 0; plane < kMostPlanes; ++plane) {
+      Guess guess;
+      const auto isOff = [&](const Sample& s) {
+        return std::fabs(s.columns - guess(s.x, s.y)) > kOnPlane;
+      };
+      const bool smooth = plane == 0 && fitPlane(left, 1, &guess) &&
+                          std::count_if(left.begin(), left.end(), isOff) * 6 <=
+                              static_cast<std::ptrdiff_t>(left.size());
+      if (!smooth && (!samplePlane(left, needed, &guess) || !fitPlane(left, 3, &guess))) return;
+      const auto end =
+          std::remove_if(left.begin(), left.end(), [&](const Sample& s) { return !isOff(s); });
+      if (left.end() - end < 3 * needed) return;
+      left.erase(end, left.end());
+      scratch->guesses.push_back(guess);
+      if (static_cast<int>(left.size()) < 3 * needed) return;
     }
   }
 
-  /// The plane that most samples lie on: least squares, reweighted.
-  static void fitPlane(const std::vector<Eigen::Vector3f>& samples, Guess* guess) {
+  /// The plane through three neighbouring samples that most others lie on.
+  static bool samplePlane(const std::vector<Sample>& samples, int needed, Guess* guess) {
+    constexpr int kTrials = 24;
+    const std::size_t n = samples.size();
+    const std::size_t stride = std::max<std::size_t>(1, n / 96);
+    std::uint32_t random = 12345;
+    int best = 3 * needed / static_cast<int>(stride);
+    bool found = false;
+    for (int trial = 0; trial < kTrials; ++trial) {
+      random = random * 1664525u + 1013904223u;
+      const std::size_t i = (random >> 8) % n;
+      const Sample &a = samples[i], &b = samples[(i + 3 + trial % 4) % n];
+      const Sample& c = samples[(i + 60 + trial) % n];
+      const float bx = b.x - a.x, by = b.y - a.y, cx = c.x - a.x, cy = c.y - a.y;
+      const float area = bx * cy - by * cx;
+      if (std::fabs(area) < 40) continue;
+      const float bz = b.columns - a.columns, cz = c.columns - a.columns;
+      Guess trial_plane;
+      trial_plane.x = (bz * cy - cz * by) / area;
+      trial_plane.y = (cz * bx - bz * cx) / area;
+      if (std::hypot(trial_plane.x, trial_plane.y) > kSteepest) continue;
+      trial_plane.at = a.columns - trial_plane.x * a.x - trial_plane.y * a.y;
+      int on = 0;
+      for (std::size_t k = 0; k < n; k += stride) {
+        on += std::fabs(samples[k].columns - trial_plane(samples[k].x, samples[k].y)) < 1.5f;
+      }
+      if (on <= best) continue;
+      best = on;
+      *guess = trial_plane;
+      found = true;
+    }
+    return found;
+  }
+
+  /// Least squares, reweighted. @param rounds 1: from scratch; 3: only refined
+  static bool fitPlane(const std::vector<Sample>& samples, int start, Guess* guess) {
     const std::size_t stride = std::max<std::size_t>(1, samples.size() / 96);
-    Eigen::Vector3f plane = Eigen::Vector3f::Zero();
-    for (int iteration = 0; iteration < 4; ++iteration) {
+    Eigen::Vector3f plane((*guess).x, (*guess).y, (*guess)(kMiddleX, kMiddleY));
+    for (int iteration = start - 1; iteration < 4; ++iteration) {
       Eigen::Matrix3f A = Eigen::Matrix3f::Zero();
       Eigen::Vector3f b = Eigen::Vector3f::Zero();
       for (std::size_t i = 0; i < samples.size(); i += stride) {
-        const Eigen::Vector3f row(samples[i].x() - kMiddleX, samples[i].y() - kMiddleY, 1);
-        const float error = samples[i].z() - plane.dot(row);
+        const Eigen::Vector3f row(samples[i].x - kMiddleX, samples[i].y - kMiddleY, 1);
+        const float error = samples[i].columns - plane.dot(row);
         const float scale = iteration == 1 ? 6.0f : 2.0f;
         const float weight = iteration == 0 ? 1.0f : 1 / (1 + error * error / (scale * scale));
         A += weight * row * row.transpose();
-        b += weight * samples[i].z() * row;
+        b += weight * samples[i].columns * row;
       }
       A.diagonal().array() += 1e-3f;
       plane = A.inverse() * b;
-      if (!plane.allFinite()) return;
+      if (!plane.allFinite()) return false;
     }
     guess->x = plane.x();
     guess->y = plane.y();
     guess->at = plane.z() - kMiddleX * plane.x() - kMiddleY * plane.y();
+    return std::hypot(guess->x, guess->y) <= kSteepest;
   }
 
   void matchLevel(std::size_t l) {
@@ -372,10 +496,7 @@ class SweepMatcher : public SweepPair {
     const cv::Rect& rect = tile.rect;
     if (tile.band < 0) {
       level.h(rect).setTo(kNaN);
-      if (l == 0) {
-        claim_(rect).setTo(-1);
-        claim_rows_[t] = {1, 0};
-      }
+      if (l == 0) claim_(rect).setTo(-1);
       return;
     }
     const Band& band = level.grid.bands[tile.band];
@@ -396,39 +517,34 @@ class SweepMatcher : public SweepPair {
     scratch->phi.resize(stride + 64);
     scratch->a.resize(stride + 64);
     guessTile(l, tile, band, scratch);
-    const Guess& guess = scratch->guess;
-    map_job.guess_x = guess.x;
-    const auto mapTile = [&](int y) {
+    // Epipolar coordinates of a row of the tile with its halo, from column `from` on.
+    const auto mapTile = [&](const Guess& guess, int y, int from, int count) {
       const int v = std::clamp(rect.y + y - kRadius, 0, map.size.height - 1);
       const std::uint16_t* phi = &map.phi[static_cast<std::size_t>(v) * map.size.width];
       const float* a = &map.a[static_cast<std::size_t>(v) * map.size.width];
       if (whole) {
-        phi += x0;
-        a += x0;
+        phi += x0 + from;
+        a += x0 + from;
         const std::ptrdiff_t ahead = 4 * static_cast<std::ptrdiff_t>(map.size.width);
         if (v + 4 < map.size.height) {
-          for (int x = 0; x < width; x += 16) hwy::Prefetch(a + ahead + x);
-          for (int x = 0; x < width; x += 32) hwy::Prefetch(phi + ahead + x);
+          for (int x = 0; x < count; x += 16) hwy::Prefetch(a + ahead + x);
+          for (int x = 0; x < count; x += 32) hwy::Prefetch(phi + ahead + x);
         }
       } else {
-        for (int x = 0; x < width; ++x) {
-          const int u = std::clamp(x0 + x, 0, map.size.width - 1);
+        for (int x = 0; x < count; ++x) {
+          const int u = std::clamp(x0 + from + x, 0, map.size.width - 1);
           scratch->phi[x] = phi[u];
           scratch->a[x] = a[u];
         }
         phi = scratch->phi.data();
         a = scratch->a.data();
       }
-      map_job.guess = guess.at + guess.y * static_cast<float>(y - kRadius) - guess.x * kRadius;
+      map_job.guess_x = guess.x;
+      map_job.guess = guess(static_cast<float>(from - kRadius), static_cast<float>(y - kRadius));
       map_job.dither_phase = y * kDitherY;
-      mapRow(map_job, phi, a, width, &scratch->base[y * stride], &scratch->residual[y * stride]);
+      mapRow(map_job, phi, a, count, &scratch->base[y * stride + from],
+             &scratch->residual[y * stride + from]);
     };
-    for (int y = 0; y < height; ++y) mapTile(y);
-    // Where pixels and columns run in step, costs peak sharply and would lock on to columns.
-    if (inStep(&scratch->residual[0], stride, width, height)) {
-      map_job.dither = 1;
-      for (int y = 0; y < height; ++y) mapTile(y);
-    }
     describeTile(l, tile, band, stride, scratch);
 
     const std::size_t inner = rect.area() + 64;
@@ -437,30 +553,44 @@ class SweepMatcher : public SweepPair {
     scratch->before.resize(inner);
     scratch->after.resize(inner);
     ChunkJob job;
-    job.width = width;
-    job.height = height;
     job.stride = stride;
-
-    job.base = scratch->base.data();
-
-    for (int p = 0; p < kPlanes; ++p) {
-      job.reference[p] = scratch->reference[p].data();
-      job.cells[p] = level.cells[p].data() + level.slack;
-    }
     job.cost = scratch->cost.data();
     job.index = scratch->index.data();
     job.before = scratch->before.data();
     job.after = scratch->after.data();
     job.scratch = &scratch->costs;
-    job.fresh = true;
-    for (const auto& [from, to] : guess.intervals) {
-      for (job.first = from - 1; job.first < to; job.first += job.lanes - 2) {
-        job.lanes = to - job.first < 15 ? 16 : 32;
-        matchChunk(job);
-        job.fresh = false;
+    for (std::size_t pass = 0; pass < scratch->guesses.size(); ++pass) {
+      const Guess& guess = scratch->guesses[pass];
+      const cv::Rect& where = guess.where;
+      job.width = where.width + 2 * kRadius;
+      job.height = where.height + 2 * kRadius;
+      const std::size_t corner = static_cast<std::size_t>(where.y) * stride + where.x;
+      const auto mapAll = [&] {
+        for (int y = where.y; y < where.y + job.height; ++y) mapTile(guess, y, where.x, job.width);
+      };
+      map_job.dither = 0;
+      mapAll();
+      // Where pixels and columns run in step, costs peak sharply and would lock on to columns.
+      if (inStep(&scratch->residual[corner], stride, job.width, job.height)) {
+        map_job.dither = 1;
+        mapAll();
       }
+      job.base = scratch->base.data() + corner;
+      for (int p = 0; p < kPlanes; ++p) {
+        job.reference[p] = scratch->reference[p].data() + corner;
+        job.cells[p] = level.cells[p].data() + level.slack;
+      }
+      job.fresh = true;
+      for (const auto& [from, to] : guess.intervals) {
+        for (job.first = from - 1; job.first < to; job.first += job.lanes - 2) {
+          job.lanes = to - job.first < 15 ? 16 : 32;
+          matchChunk(job);
+          job.fresh = false;
+        }
+      }
+      concludeTile(l, t, stride, guess, pass > 0, scratch);
     }
-    concludeTile(l, t, stride, scratch);
+    if (l == 0) claimTile(rect, scratch);
   }
 
   /// Whether the pixels of most windows fall on columns alike, so that rounding does not average
@@ -540,86 +670,134 @@ class SweepMatcher : public SweepPair {
     }
   }
 
-  void concludeTile(std::size_t l, std::size_t t, int stride, Scratch* scratch) {
+  /// @param merge whether another pass was concluded before; the lower cost wins
+  void concludeTile(std::size_t l, std::size_t t, int stride, const Guess& guess, bool merge,
+                    Scratch* scratch) {
     Level& level = levels_[l];
     const Tile& tile = level.layout.tiles[t];
     const Band& band = level.grid.bands[tile.band];
-    const cv::Rect& rect = tile.rect;
+    const cv::Rect where = guess.where + tile.rect.tl();
     scratch->residual_line.resize(stride + 64);
     scratch->residual_mean.resize(stride + 64);
+    if (merge) {
+      scratch->row_h.resize(stride + 64);
+      scratch->row_steep.resize(stride + 64);
+      scratch->row_claim.resize(stride + 64);
+    } else {
+      scratch->best_cost.resize(tile.rect.area());
+    }
     ConcludeJob job;
-    job.count = rect.width;
+    job.count = where.width;
     job.residual = scratch->residual_mean.data();
     job.mask = tile.clear ? nullptr : level.grid.mask.data();
     job.cells = level.grid.cells;
     job.step_h = static_cast<float>(band.step_h);
-    const Guess& guess = scratch->guess;
     job.guess_x = guess.x;
     job.worst_cost = kWorstShare * kFullCost;
-    job.claim_units = 4 / finest_step_;
     job.claim_x = claim_x_;
     job.claim_y = claim_x_;
     job.claim_y_offset = claim_y_offset_;
     job.claim_width = claim_size_.width;
     job.claim_height = claim_size_.height;
-    for (int y = 0; y < rect.height; ++y) {
-      boxMeanRow(&scratch->residual[y * stride], stride, rect.width, scratch->residual_line.data(),
+    for (int y = 0; y < where.height; ++y) {
+      const std::size_t corner =
+          static_cast<std::size_t>(guess.where.y + y) * stride + guess.where.x;
+      boxMeanRow(&scratch->residual[corner], stride, where.width, scratch->residual_line.data(),
                  scratch->residual_mean.data());
-      const std::size_t i = static_cast<std::size_t>(y) * rect.width;
+      const std::size_t i = static_cast<std::size_t>(y) * where.width;
       const std::size_t pixel =
-          static_cast<std::size_t>(rect.y + y) * level.map.size.width + rect.x;
+          static_cast<std::size_t>(where.y + y) * level.map.size.width + where.x;
       job.cost = &scratch->cost[i];
       job.index = &scratch->index[i];
       job.before = &scratch->before[i];
       job.after = &scratch->after[i];
-      job.base = &scratch->base[(y + kRadius) * stride + kRadius];
+      job.base = &scratch->base[corner + kRadius * stride + kRadius];
       job.phi = &level.map.phi[pixel];
       job.a = &level.map.a[pixel];
-      job.h = level.h.ptr<float>(rect.y + y) + rect.x;
+      job.guess = guess(static_cast<float>(guess.where.x), static_cast<float>(guess.where.y + y));
+      std::uint16_t* best =
+          &scratch->best_cost[static_cast<std::size_t>(guess.where.y + y) * tile.rect.width +
+                              guess.where.x];
+      float* h = level.h.ptr<float>(where.y + y) + where.x;
+      std::uint16_t *steep = nullptr, *cost = nullptr;
+      std::int32_t* claim = nullptr;
       if (l == 0) {
-        job.steep = steep_.ptr<std::uint16_t>(rect.y + y) + rect.x;
-        job.claim = claim_.ptr<std::int32_t>(rect.y + y) + rect.x;
-        job.value = value_.ptr<std::int32_t>(rect.y + y) + rect.x;
+        cost = cost_.ptr<std::uint16_t>(where.y + y) + where.x;
+        steep = steep_.ptr<std::uint16_t>(where.y + y) + where.x;
+        claim = claim_.ptr<std::int32_t>(where.y + y) + where.x;
       }
-      job.guess = guess.at + guess.y * static_cast<float>(y);
-      if (y + 2 < rect.height) {
-        for (int x = 0; x < rect.width; x += 16) {
-          __builtin_prefetch(job.h + 2 * level.h.step1() + x, 1);
-          if (l > 0) continue;
-          __builtin_prefetch(job.value + 2 * value_.step1() + x, 1);
-          __builtin_prefetch(job.claim + 2 * claim_.step1() + x, 1);
+      if (y + 2 < where.height) {
+        for (int x = 0; x < where.width; x += 16) {
+          __builtin_prefetch(h + 2 * level.h.step1() + x, 1);
+          if (l == 0) __builtin_prefetch(claim + 2 * claim_.step1() + x, 1);
         }
+      }
+      job.h = merge ? scratch->row_h.data() : h;
+      if (l == 0) {
+        job.steep = merge ? scratch->row_steep.data() : steep;
+        job.claim = merge ? scratch->row_claim.data() : claim;
       }
       concludeRow(&job);
+      if (!merge) {
+        std::copy_n(job.cost, where.width, best);
+        if (l == 0) std::copy_n(job.cost, where.width, cost);
+        // Vectors wrote past the end of the row.
+        if (where.br().x == level.h.cols) std::fill_n(h + where.width, 16, kNaN);
+        continue;
+      }
+      for (int x = 0; x < where.width; ++x) {
+        if (job.cost[x] >= best[x]) continue;
+        best[x] = job.cost[x];
+        h[x] = job.h[x];
+        if (l > 0) continue;
+        cost[x] = job.cost[x];
+        steep[x] = job.steep[x];
+        claim[x] = job.claim[x];
+      }
     }
-    if (l > 0) return;
-    claim_rows_[t] = {job.claim_first, job.claim_last};
   }
 
-  /// Two pixels that see one spot of the displaced image: the better match has it.
-  void claimAll() {
-    Level& level = levels_.front();
-    constexpr int kStrip = 160;
-    const int strips = (claim_size_.height + kStrip - 1) / kStrip;
-    parallelFor(0, strips, options_.threads, [&](std::size_t s) {
-      const int begin = static_cast<int>(s) * kStrip;
-      const int end = std::min(begin + kStrip, claim_size_.height);
-      const std::int32_t first = begin * claim_size_.width, last = end * claim_size_.width;
-      std::int32_t* claims = claims_.data();
-      std::fill(claims + first, claims + last, std::numeric_limits<std::int32_t>::max());
-      for (std::size_t t = 0; t < level.layout.tiles.size(); ++t) {
-        if (claim_rows_[t].second < begin || claim_rows_[t].first >= end) continue;
-        const cv::Rect& rect = level.layout.tiles[t].rect;
-        for (int y = rect.y; y < rect.br().y; ++y) {
-          const std::int32_t* claim = claim_.ptr<std::int32_t>(y);
-          const std::int32_t* value = value_.ptr<std::int32_t>(y);
-          for (int x = rect.x; x < rect.br().x; ++x) {
-            if (claim[x] >= first && claim[x] < last)
-              claims[claim[x]] = std::min(claims[claim[x]], value[x]);
-          }
-        }
+  ClaimJob claimJob(std::int32_t* claims) const {
+    ClaimJob job;
+    job.claims = claims;
+    job.none = claim_size_.area();
+    job.units = kClaimUnits / finest_step_;
+    return job;
+  }
+
+  /// Of pixels that see one spot of the displaced image the best match has it.
+  void claimTile(const cv::Rect& rect, Scratch* scratch) const {
+    const Level& level = levels_.front();
+    std::vector<std::int32_t>& claims = scratch->claims;
+    if (claims.empty()) claims.assign(claim_size_.area() + kClaimSlack, kUnclaimed);
+    ClaimJob job = claimJob(claims.data());
+    job.count = rect.width;
+    for (int y = rect.y; y < rect.br().y; ++y) {
+      job.claim = claim_.ptr<std::int32_t>(y) + rect.x;
+      job.h = level.h.ptr<float>(y) + rect.x;
+      job.cost = cost_.ptr<std::uint16_t>(y) + rect.x;
+      claimRow(job);
+    }
+  }
+
+  /// Brings together what the threads have.
+  /// @return null where nothing was claimed
+  std::int32_t* settleClaims() {
+    std::vector<std::int32_t*> all;
+    for (Scratch& scratch : scratch_)
+      if (!scratch.claims.empty()) all.push_back(scratch.claims.data());
+    if (all.size() < 2) return all.empty() ? nullptr : all.front();
+    constexpr int kPart = 16384;
+    const int count = claim_size_.area();
+    parallelFor(0, (count + kPart - 1) / kPart, options_.threads, [&](std::size_t part) {
+      const int begin = static_cast<int>(part) * kPart, end = std::min(begin + kPart, count);
+      for (std::size_t k = 1; k < all.size(); ++k) {
+        std::int32_t* to = all[0];
+        const std::int32_t* from = all[k];
+        for (int i = begin; i < end; ++i) to[i] = std::min(to[i], from[i]);
       }
     });
+    return all.front();
   }
 
   void finish(MatchResult* result, Stopwatch* watch) {
@@ -635,41 +813,6 @@ class SweepMatcher : public SweepPair {
     };
     auto& rejected = result->statistics.rejected;
 
-    claimAll();
-    watch->lap("claims");
-    std::vector<std::size_t> matched(strips), lost(strips);
-    forRows([&](std::size_t s, int begin, int end) {
-      for (int y = begin; y < end; ++y) {
-        std::int32_t* claim = claim_.ptr<std::int32_t>(y);
-        float* h = level.h.ptr<float>(y);
-        // Vectors read past the row, where the last frame left anything.
-        std::fill(claim + width, claim + width + 64, -1);
-        matched[s] += width - std::count(claim, claim + width, -1);
-        std::fill(h + width, h + width + 64, kNaN);
-        lost[s] +=
-            checkRow(claims_.data(), claim, value_.ptr<std::int32_t>(y), kClaimTolerance, h, width);
-      }
-    });
-    watch->lap("check");
-    rejected["no match"] = field_ - std::accumulate(matched.begin(), matched.end(), std::size_t{0});
-    rejected["left-right"] = std::accumulate(lost.begin(), lost.end(), std::size_t{0});
-
-    const std::vector<float> nothing(width + 128, kNaN);
-    forRows([&](std::size_t, int begin, int end) {
-      for (int y = begin; y < end; ++y) {
-        const auto line = [&](int v) {
-          return v < 0 || v >= height ? nothing.data() + 16 : level.h.ptr<float>(v);
-        };
-        const float* rows[3] = {line(y - 1), line(y), line(y + 1)};
-        medianRow(rows, width, smooth_.ptr<float>(y));
-      }
-    });
-    watch->lap("median");
-    rejected["speckle"] =
-        removeSpeckles(&smooth_, finest_step_, std::max(kSpeckle, width * height / kSpeckleShare),
-                       options_.threads);
-    watch->lap("speckle");
-
     // Planes that nobody holds any more are used again: fresh memory costs a millisecond.
     cv::Mat* planes[3] = {&result->range, &result->sigma, &result->score};
     for (int i = 0; i < 3; ++i) {
@@ -677,9 +820,74 @@ class SweepMatcher : public SweepPair {
         planes_[i] = cv::Mat(height, width, CV_32FC1);
       *planes[i] = planes_[i];
     }
-    std::vector<TriangulateJob> jobs(strips);
+    cv::Mat& smooth = result->range;  // till it is range
+
+    std::vector<std::int32_t> unclaimed;
+    std::int32_t* claims = settleClaims();
+    if (!claims) {
+      unclaimed.assign(claim_size_.area() + kClaimSlack, kUnclaimed);
+      claims = unclaimed.data();
+    }
+    watch->lap("claims");
+    std::vector<RejectJob> jobs(strips);
     forRows([&](std::size_t s, int begin, int end) {
-      TriangulateJob& job = jobs[s];
+      // The rows of the strip and those around it, free of what is not to be believed.
+      Scratch& scratch = scratch_.local();
+      scratch.nothing.assign(width + 128, kNaN);
+      for (auto& row : scratch.rows) row.assign(width + 128, kNaN);
+      RejectJob& job = jobs[s];
+      job.claimed = claimJob(claims);
+      job.claimed.count = width;
+      job.tolerance = kClaimTolerance;
+      job.jump = kEdgeJump * finest_step_;
+      const auto reject = [&](int y) {
+        job.out = scratch.rows[(y + 3) % 3].data() + 16;
+        if (y < 0 || y >= height) {
+          std::fill(job.out, job.out + width, kNaN);
+          return;
+        }
+        for (int k = 0; k < 3; ++k) {
+          const int v = y + (k - 1) * RejectJob::kReach;
+          const bool there = v >= 0 && v < height;
+          job.h[k] = there ? level.h.ptr<float>(v) : scratch.nothing.data() + 16;
+          job.cost[k] = cost_.ptr<std::uint16_t>(there ? v : y);
+        }
+        job.claimed.h = job.h[1];
+        job.claimed.cost = job.cost[1];
+        job.claimed.claim = claim_.ptr<std::int32_t>(y);
+        const RejectJob before = job;
+        rejectRow(&job);
+        // What belongs to the strips around is counted there.
+        if (y < begin || y >= end) job = before;
+        std::fill_n(job.out + width, 32, kNaN);
+      };
+      reject(begin - 1);
+      reject(begin);
+      for (int y = begin; y < end; ++y) {
+        reject(y + 1);
+        const float* rows[3];
+        for (int k = 0; k < 3; ++k) rows[k] = scratch.rows[(y + k + 2) % 3].data() + 16;
+        medianRow(rows, width, smooth.ptr<float>(y));
+      }
+    });
+    std::size_t found = 0, lost = 0, edge = 0;
+    for (const RejectJob& job : jobs) {
+      found += job.found;
+      lost += job.lost;
+      edge += job.edge;
+    }
+    rejected["no match"] = field_ - found;
+    rejected["left-right"] = lost;
+    rejected["depth edge"] = edge;
+    watch->lap("check");
+    rejected["speckle"] =
+        removeSpeckles(&smooth, finest_step_, std::max(kSpeckle, width * height / kSpeckleShare),
+                       options_.threads);
+    watch->lap("speckle");
+
+    std::vector<TriangulateJob> points(strips);
+    forRows([&](std::size_t s, int begin, int end) {
+      TriangulateJob& job = points[s];
       job.count = width;
       job.baseline = static_cast<float>(frame_.baseline);
       job.step_h = finest_step_;
@@ -689,8 +897,8 @@ class SweepMatcher : public SweepPair {
       job.full_cost = kWorstShare * kFullCost;
       for (int y = begin; y < end; ++y) {
         job.a = &level.map.a[static_cast<std::size_t>(y) * width];
-        job.h = smooth_.ptr<float>(y);
-        job.value = value_.ptr<std::int32_t>(y);
+        job.h = smooth.ptr<float>(y);
+        job.cost = cost_.ptr<std::uint16_t>(y);
         job.steep = steep_.ptr<std::uint16_t>(y);
         job.range = result->range.ptr<float>(y);
         job.sigma = result->sigma.ptr<float>(y);
@@ -699,7 +907,7 @@ class SweepMatcher : public SweepPair {
       }
     });
     std::size_t out_of_range = 0, no_parallax = 0, valid = 0;
-    for (const TriangulateJob& job : jobs) {
+    for (const TriangulateJob& job : points) {
       out_of_range += job.out_of_range;
       no_parallax += job.no_parallax;
       valid += job.valid;
@@ -715,15 +923,13 @@ class SweepMatcher : public SweepPair {
   EpipolarFrame frame_;
   std::vector<Level> levels_;
   tbb::enumerable_thread_specific<Scratch> scratch_;
-  cv::Mat value_, steep_, claim_, smooth_;  ///< of the finest level
-  cv::Mat planes_[3];                       ///< of the last result
-  std::size_t field_ = 0;                   ///< pixels with a ray
-  float finest_step_ = 0;                   ///< least hypothesis step of any band
+  cv::Mat cost_, steep_, claim_;  ///< of the finest level
+  cv::Mat planes_[3];             ///< of the last result
+  std::size_t field_ = 0;         ///< pixels with a ray
+  float finest_step_ = 0;         ///< least hypothesis step of any band
   // Claims on spots of the displaced image, kept on an equal-area map of (phi, theta').
-  std::vector<std::int32_t> claims_;
   cv::Size claim_size_;
   float claim_x_ = 0, claim_y_offset_ = 0;
-  std::vector<std::pair<int, int>> claim_rows_;  ///< by tile, first and last
 };
 
 }  // namespace

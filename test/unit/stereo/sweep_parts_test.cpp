@@ -234,6 +234,83 @@ TEST_P(EverySet, MedianIsThatOfNine) {
   EXPECT_GT(checked, 50);
 }
 
+TEST_P(EverySet, ClaimsAndEdgesRejectWhatTheyShould) {
+  std::mt19937 random(13);
+  constexpr int kCount = 77, kSpots = 50, kReach = RejectJob::kReach;
+  constexpr float kUnits = 4;
+  std::vector<float> h[3];
+  std::vector<std::uint16_t> cost[3];
+  for (int r = 0; r < 3; ++r) {
+    h[r].resize(kCount + 130);
+    cost[r].resize(kCount + 130);
+    for (float& v : h[r])
+      v = random() % 7 == 0 ? kNaN : static_cast<float>(random() % 3) * 2.0f + 0.125f;
+    for (auto& v : cost[r]) v = static_cast<std::uint16_t>(20 + random() % 300);
+  }
+  std::vector<std::int32_t> claim(kCount + 64, 7), claims(kSpots + kClaimSlack, INT32_MAX);
+  for (int x = 0; x < kCount; ++x)
+    claim[x] = std::isnan(h[1][x + 16]) ? -1 : static_cast<int>(random() % kSpots);
+  ClaimJob job;
+  job.count = kCount;
+  job.claim = claim.data();
+  job.h = &h[1][16];
+  job.cost = &cost[1][16];
+  job.units = kUnits;
+  job.claims = claims.data();
+  job.none = kSpots;
+  claimRow(job);
+  RejectJob reject;
+  reject.claimed = job;
+  reject.tolerance = 6;
+  reject.jump = 1.5f;
+  for (int r = 0; r < 3; ++r) {
+    reject.h[r] = &h[r][16];
+    reject.cost[r] = &cost[r][16];
+  }
+  std::vector<float> out(kCount + 64);
+  reject.out = out.data();
+  rejectRow(&reject);
+  std::size_t found = 0, lost = 0, edge = 0;
+  for (int x = 0; x < kCount; ++x) {
+    const float own = h[1][x + 16];
+    if (std::isnan(own)) {
+      EXPECT_TRUE(std::isnan(out[x]));
+      continue;
+    }
+    ++found;
+    // The winner of the spot: the least cost, then the smaller hypothesis.
+    int winner = x;
+    for (int i = 0; i < kCount; ++i) {
+      if (claim[i] != claim[x]) continue;
+      const auto key = [&](int k) { return std::pair(cost[1][k + 16], h[1][k + 16]); };
+      if (key(i) < key(winner)) winner = i;
+    }
+    const bool is_lost = std::fabs(h[1][winner + 16] - own) * kUnits > 6;
+    bool is_edge = false;
+    const auto look = [&](int row, int dx) {
+      const float outside = h[1 + row][x + 16 + dx], inside = h[1 - row][x + 16 - dx];
+      is_edge = is_edge || (own - outside > 1.5f && std::fabs(own - inside) < 1.5f &&
+                            10 * (cost[1][x + 16] - 40) > 13 * cost[1 - row][x + 16 - dx]);
+    };
+    look(-1, 0);
+    look(1, 0);
+    look(0, -kReach);
+    look(0, kReach);
+    lost += is_lost;
+    edge += !is_lost && is_edge;
+    EXPECT_EQ(std::isnan(out[x]), is_lost || is_edge) << x;
+    if (!is_lost && !is_edge) {
+      EXPECT_EQ(out[x], own);
+    }
+  }
+  EXPECT_GT(lost, 5u);
+  EXPECT_GT(edge, 3u);
+  EXPECT_GT(found, lost + edge + 10);
+  EXPECT_EQ(reject.found, found);
+  EXPECT_EQ(reject.lost, lost);
+  EXPECT_EQ(reject.edge, edge);
+}
+
 TEST_P(EverySet, SamplesBetweenPixels) {
   std::mt19937 random(9);
   cv::Mat image(40, 50, CV_8UC1);
