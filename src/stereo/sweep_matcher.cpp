@@ -165,7 +165,7 @@ class SweepMatcher : public SweepPair {
   MatchResult match(const cv::Mat& reference, const std::vector<cv::Mat>& displaced) override {
     checkImages(geometry_, reference, displaced);
     const auto start = std::chrono::steady_clock::now();
-    for (Scratch& scratch : scratch_) scratch.claims.clear();
+    for (Scratch& scratch : *scratch_) scratch.claims.clear();
     MatchResult result;
     Stopwatch watch(&result.statistics.seconds);
     makePyramid(reference, &Level::reference);
@@ -203,8 +203,7 @@ class SweepMatcher : public SweepPair {
         std::fill_n(own.cells[p].end() - own.slack, own.slack, std::uint8_t{0});
       }
     }
-    for (auto member : {&SweepMatcher::value_, &SweepMatcher::steep_, &SweepMatcher::claim_,
-                        &SweepMatcher::smooth_}) {
+    for (auto member : {&SweepMatcher::cost_, &SweepMatcher::steep_, &SweepMatcher::claim_}) {
       this->*member = other->*member;
       (other->*member).release();
     }
@@ -212,8 +211,7 @@ class SweepMatcher : public SweepPair {
       planes_[i] = other->planes_[i];
       other->planes_[i].release();
     }
-    claims_ = std::move(other->claims_);
-    claims_.resize(static_cast<std::size_t>(claim_size_.area()));
+    std::swap(scratch_, other->scratch_);
   }
 
  private:
@@ -263,7 +261,7 @@ class SweepMatcher : public SweepPair {
     const Grid& grid = level->grid;
     for (const Band& band : grid.bands) {
       parallelFor(0, (band.rows + kStrip - 1) / kStrip, options_.threads, [&](std::size_t strip) {
-        Scratch& scratch = scratch_.local();
+        Scratch& scratch = scratch_->local();
         const int begin = static_cast<int>(strip) * kStrip;
         const int end = std::min(begin + kStrip, band.rows);
         const int first = std::max(begin - 2, 0), last = std::min(end + 2, band.rows);
@@ -486,7 +484,7 @@ class SweepMatcher : public SweepPair {
   void matchLevel(std::size_t l) {
     Level& level = levels_[l];
     parallelFor(0, level.layout.tiles.size(), options_.threads,
-                [&](std::size_t t) { matchTile(l, t, &scratch_.local()); });
+                [&](std::size_t t) { matchTile(l, t, &scratch_->local()); });
   }
 
   void matchTile(std::size_t l, std::size_t t, Scratch* scratch) {
@@ -784,7 +782,7 @@ class SweepMatcher : public SweepPair {
   /// @return null where nothing was claimed
   std::int32_t* settleClaims() {
     std::vector<std::int32_t*> all;
-    for (Scratch& scratch : scratch_)
+    for (Scratch& scratch : *scratch_)
       if (!scratch.claims.empty()) all.push_back(scratch.claims.data());
     if (all.size() < 2) return all.empty() ? nullptr : all.front();
     constexpr int kPart = 16384;
@@ -832,7 +830,7 @@ class SweepMatcher : public SweepPair {
     std::vector<RejectJob> jobs(strips);
     forRows([&](std::size_t s, int begin, int end) {
       // The rows of the strip and those around it, free of what is not to be believed.
-      Scratch& scratch = scratch_.local();
+      Scratch& scratch = scratch_->local();
       scratch.nothing.assign(width + 128, kNaN);
       for (auto& row : scratch.rows) row.assign(width + 128, kNaN);
       RejectJob& job = jobs[s];
@@ -922,7 +920,8 @@ class SweepMatcher : public SweepPair {
   MatcherOptions options_;
   EpipolarFrame frame_;
   std::vector<Level> levels_;
-  tbb::enumerable_thread_specific<Scratch> scratch_;
+  std::unique_ptr<tbb::enumerable_thread_specific<Scratch>> scratch_ =
+      std::make_unique<tbb::enumerable_thread_specific<Scratch>>();
   cv::Mat cost_, steep_, claim_;  ///< of the finest level
   cv::Mat planes_[3];             ///< of the last result
   std::size_t field_ = 0;         ///< pixels with a ray
