@@ -224,7 +224,7 @@ struct NumberFeature {
   double (*get)(ArvCamera*, GError**);
 };
 constexpr NumberFeature kExposure = {"exposure time",
-                                     "us",
+                                     " us",
                                      arv_camera_is_exposure_time_available,
                                      arv_camera_get_exposure_time_bounds,
                                      arv_camera_set_exposure_time,
@@ -242,7 +242,7 @@ constexpr NumberFeature kBlackLevel = {"black level",
                                        arv_camera_set_black_level,
                                        arv_camera_get_black_level};
 constexpr NumberFeature kFrameRate = {"frame rate",
-                                      "Hz",
+                                      " Hz",
                                       arv_camera_is_frame_rate_available,
                                       arv_camera_get_frame_rate_bounds,
                                       arv_camera_set_frame_rate,
@@ -505,7 +505,7 @@ class AravisCamera : public Camera {
     const std::optional<double> taken = read(feature);
     if (taken && std::abs(*taken - wanted) > 0.01 * std::max(std::abs(wanted), 1e-3)) {
       remarks_.push_back(std::string(feature.name) + ": asked for " + formatNumber(wanted) +
-                         ", the camera took " + formatNumber(*taken) + " " + feature.unit);
+                         ", the camera took " + formatNumber(*taken) + feature.unit);
     }
   }
 

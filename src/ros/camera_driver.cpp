@@ -6,6 +6,8 @@
 
 #include <boost/make_shared.hpp>
 #include <cmath>
+#include <iomanip>
+#include <sstream>
 
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/parameters.h"
@@ -17,6 +19,9 @@ using Steady = std::chrono::steady_clock;
 constexpr std::chrono::milliseconds kGrabTimeout(200);
 // An unplugged camera is told of once, and again now and then.
 constexpr std::chrono::seconds kRepeatProblem(30);
+constexpr std::chrono::seconds kPollStatistics(1);
+// A service waits so long for the device; what is asked for is done later all the same.
+constexpr std::chrono::seconds kDeviceAnswers(3);
 // The stage of a recording stands at its position this long around a settled frame [s], and no
 // longer than the intervals between frames allow.
 constexpr double kSettledAround = 0.0491;
@@ -41,6 +46,40 @@ std::string describe(const device::CameraIdentity& identity) {
   return identity.vendor + " " + identity.model + " (" + identity.serial + ")";
 }
 
+/// What the device told; the rest stays.
+void fromControls(const device::CameraControls& controls, CameraConfig* config) {
+  if (controls.exposure_us) config->exposure_us = *controls.exposure_us;
+  if (controls.gain) config->gain = *controls.gain;
+  if (controls.black_level) config->black_level = *controls.black_level;
+  if (controls.frame_rate_hz) config->frame_rate = *controls.frame_rate_hz;
+  if (!controls.exposure_auto.empty()) config->exposure_auto = controls.exposure_auto;
+  if (!controls.gain_auto.empty()) config->gain_auto = controls.gain_auto;
+}
+
+/// The frame's own memory as a message where that can be; it goes back to its pool with the
+/// message.
+sensor_msgs::ImagePtr toMessage(const device::Frame& frame) {
+  const cv::Mat& image = frame.image;
+  if (!frame.memory || frame.memory->bytes.data() != image.data || image.rows == 0) {
+    return toImage(image, frame.encoding);
+  }
+  const std::size_t bytes = image.step[0] * static_cast<std::size_t>(image.rows);
+  if (bytes > frame.memory->bytes.size()) return toImage(image, frame.encoding);
+  const boost::shared_ptr<sensor_msgs::Image> message(
+      new sensor_msgs::Image, [memory = frame.memory](sensor_msgs::Image* done) {
+        memory->bytes = std::move(done->data);
+        delete done;
+      });
+  message->width = static_cast<std::uint32_t>(image.cols);
+  message->height = static_cast<std::uint32_t>(image.rows);
+  message->encoding = frame.encoding;
+  message->is_bigendian = 0;
+  message->step = static_cast<std::uint32_t>(image.step[0]);
+  message->data = std::move(frame.memory->bytes);
+  message->data.resize(bytes);
+  return message;
+}
+
 }  // namespace
 
 CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
@@ -55,15 +94,43 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   if (!p.name.empty()) LensStore(p.store).pathOf(p.name);  // refuses names with path parts
   p.settings.frame_rate_hz =
       source.number("frame_rate", 0.0, 0.0, 1000.0, "Hz (0: the device's own)");
-  if (source.has("exposure_us")) {
-    p.settings.exposure_us = source.number("exposure_us", 0.0, 1.0, 60e6, "us");
-  }
-  if (source.has("gain")) p.settings.gain = source.number("gain", 0.0, -100.0, 1000.0);
-  source.ignore("exposure_us");
-  source.ignore("gain");
+  const double exposure = source.number("exposure_us", 0.0, 0.0, 60e6, "us (0: the device's own)");
+  if (exposure > 0.0) p.settings.exposure_us = exposure;
+  const auto optional = [&source](const char* key, double min,
+                                  double max) -> std::optional<double> {
+    source.ignore(key);
+    if (!source.has(key)) return std::nullopt;
+    return source.number(key, 0.0, min, max);
+  };
+  p.settings.gain = optional("gain", -100.0, 1000.0);
+  p.settings.black_level = optional("black_level", -10000.0, 10000.0);
+  p.settings.exposure_auto = source.choice("exposure_auto", "", {"", "off", "once", "continuous"});
+  p.settings.gain_auto = source.choice("gain_auto", "", {"", "off", "once", "continuous"});
   p.settings.pixel_format = source.text("pixel_format", "");
-  p.settings.trigger =
-      source.choice("trigger", "off", {"off", "software", "line0", "line1", "line2", "line3"});
+  p.settings.trigger = source.choice(
+      "trigger", "off",
+      {"off", "software", "line0", "line1", "line2", "line3", "line4", "line5", "line6", "line7"});
+  constexpr int kMostPixels = 65535;
+  p.settings.size.width = source.integer("width", 0, 0, kMostPixels);
+  p.settings.size.height = source.integer("height", 0, 0, kMostPixels);
+  if ((p.settings.size.width == 0) != (p.settings.size.height == 0)) {
+    throw InputError("parameters", "width, height", "expected both, or none");
+  }
+  p.settings.offset.x = source.integer("offset_x", -1, -1, kMostPixels);
+  p.settings.offset.y = source.integer("offset_y", -1, -1, kMostPixels);
+  p.settings.binning.width = source.integer("binning_x", 0, 0, 16);
+  p.settings.binning.height = source.integer("binning_y", 0, 0, 16);
+  p.settings.features = source.texts("features");
+  p.settings.buffers = source.integer("buffers", p.settings.buffers, 2, 256);
+  p.settings.stamp_offset_us = source.number("stamp_offset_us", 0.0, -1e6, 1e6, "us");
+  p.settings.stamp_is_exposure_end =
+      source.choice("stamp_reference", "exposure_start", {"exposure_start", "exposure_end"}) ==
+      "exposure_end";
+  p.settings.packet_size = source.integer("packet_size", 0, 0, 16384);
+  p.settings.packet_delay_us = source.integer("packet_delay_us", 0, 0, 1000000);
+  p.settings.packet_resend = source.flag("packet_resend", true);
+  p.settings.socket_buffer_bytes = source.integer("socket_buffer", 0, 0, 1 << 30);
+  p.settings.chunks = source.flag("chunks", false);
   p.settings.ptp = source.flag("ptp", false);
   p.settings.loop = source.flag("loop", false);
   p.settings.paced = source.flag("paced", true);
@@ -72,6 +139,7 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   p.mount = source.pose("mount", p.mount);
   p.retry_period_s = source.number("retry_period", p.retry_period_s, 0.05, 60.0, "s");
   p.watchdog_s = source.number("watchdog", p.watchdog_s, 0.1, 600.0, "s");
+  p.exit_on_error = source.flag("exit_on_error", false);
   p.stage_frame_id = source.frame("stage_frame_id", p.stage_frame_id);
   p.stage_child_frame_id = source.frame("stage_child_frame_id", p.stage_child_frame_id);
   p.axis = source.direction("axis", p.axis);
@@ -90,7 +158,9 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
       parameters_(std::move(parameters)),
       open_(std::move(open)),
       last_report_(Steady::now()),
+      settings_(parameters_.settings),
       last_frame_(Steady::now()),
+      private_node_(private_node),
       diagnostics_(node, private_node, private_node.getNamespace()) {
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
   if (!parameters_.lens.empty()) setLens(readLensFile(parameters_.lens));
@@ -107,6 +177,9 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
   lens_subscriber_ = node_.subscribe("lens_model", 1, &CameraDriver::onLens, this);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
+  trigger_ = node_.advertiseService("trigger", &CameraDriver::onTrigger, this);
+  timer_ = node_.createWallTimer(ros::WallDuration(0.1),
+                                 [this](const ros::WallTimerEvent&) { onTimer(); });
   thread_ = std::thread(&CameraDriver::run, this);
 }
 
@@ -117,16 +190,24 @@ CameraDriver::~CameraDriver() {
   }
   wake_.notify_all();
   thread_.join();
+  {
+    // Who still waits is told that nobody comes.
+    const std::lock_guard<std::mutex> lock(mutex_);
+    tasks_.clear();
+  }
+  // Its callback uses the other members.
+  timer_.stop();
 }
 
 void CameraDriver::waitFor(double seconds) {
   const Steady::time_point end = Steady::now() + std::chrono::duration_cast<Steady::duration>(
                                                      std::chrono::duration<double>(seconds));
   while (!stop_ && Steady::now() < end) {
-    diagnostics_.update();
-    const Steady::time_point slice = std::min(end, Steady::now() + std::chrono::milliseconds(200));
-    std::unique_lock<std::mutex> lock(mutex_);
-    wake_.wait_until(lock, slice, [this] { return stop_.load(); });
+    {
+      std::unique_lock<std::mutex> lock(mutex_);
+      wake_.wait_until(lock, end, [this] { return stop_.load() || !tasks_.empty(); });
+    }
+    runTasks();
   }
 }
 
@@ -134,13 +215,11 @@ bool CameraDriver::wanted() const { return images_.getNumSubscribers() > 0; }
 
 void CameraDriver::run() {
   while (!stop_) {
-    diagnostics_.update();
     try {
-      if (openIfNeeded()) {
-        stream();
-      } else {
-        waitFor(parameters_.retry_period_s);
-      }
+      openIfNeeded();
+      runTasks();
+      stream();
+      pollStatistics();
     } catch (const std::exception& e) {
       close(e.what());
       waitFor(parameters_.retry_period_s);
@@ -154,25 +233,31 @@ void CameraDriver::run() {
   }
 }
 
-bool CameraDriver::openIfNeeded() {
-  if (camera_) return true;
-  camera_ = open_(parameters_);
+void CameraDriver::openIfNeeded() {
+  if (camera_) return;
+  CameraParameters wanted = parameters_;
+  wanted.settings = settings_;
+  camera_ = open_(wanted);
   const device::CameraIdentity identity = camera_->identity();
+  if (camera_->live()) settings_.identity = identity;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     identity_ = identity;
     problem_.clear();
     state_ = "idle";
+    opened_once_ = true;
   }
-  diagnostics_.setHardwareID(identity.serial);
   ROS_INFO_STREAM("opened " << printable(describe(identity)));
   last_sequence_.reset();
+  streamed_ = false;
   takeRemarks();
+  takeControls(camera_->controls());
+  statistics_due_ = Steady::time_point();
   chooseLens();
-  return true;
 }
 
 void CameraDriver::close(const std::string& problem) {
+  if (camera_) camera_->abandon();
   camera_.reset();
   streaming_ = false;
   {
@@ -181,7 +266,13 @@ void CameraDriver::close(const std::string& problem) {
     problem_ = problem;
     ++losses_of_device_;
   }
-  if (problem == told_problem_ && Steady::now() - told_at_ < kRepeatProblem) return;
+  const bool again = problem == told_problem_ && Steady::now() - told_at_ < kRepeatProblem;
+  if (parameters_.exit_on_error) {
+    ROS_ERROR_STREAM(printable(problem, 1000));
+    failed_ = true;
+    return;
+  }
+  if (again) return;
   told_problem_ = problem;
   told_at_ = Steady::now();
   ROS_WARN_STREAM("no camera, trying again every " << parameters_.retry_period_s
@@ -216,6 +307,7 @@ void CameraDriver::stream() {
   if (!streaming_) {
     camera_->start();
     streaming_ = true;
+    streamed_ = false;
     last_frame_ = Steady::now();
     setState("streaming");
     ROS_DEBUG("streaming");
@@ -225,6 +317,7 @@ void CameraDriver::stream() {
   if (frame) {
     countLost(*frame);
     last_frame_ = Steady::now();
+    streamed_ = true;
     publish(*frame);
   } else if (!camera_->finished()) {
     watch();
@@ -232,23 +325,174 @@ void CameraDriver::stream() {
 }
 
 void CameraDriver::watch() {
+  if (settings_.trigger != "off") return;
   const double silent = secondsSince(last_frame_);
-  const double slow =
-      parameters_.settings.frame_rate_hz > 0.0 ? 3.0 / parameters_.settings.frame_rate_hz : 0.0;
-  if (silent <= std::max(parameters_.watchdog_s, slow) || parameters_.settings.trigger != "off")
-    return;
+  if (silent <= std::max(parameters_.watchdog_s, slowest_s_)) return;
+  std::ostringstream problem;
+  problem << std::fixed << std::setprecision(1) << "the camera gives no frame for " << silent
+          << " s";
+  if (camera_->live()) {
+    if (!streamed_) {
+      problem << " although it was started (a firewall, packets larger than the network lets "
+                 "through, or too many of them for it?)";
+    }
+    throw device::CameraError(problem.str());
+  }
   {
     const std::lock_guard<std::mutex> lock(mutex_);
-    problem_ = "no frame for " + std::to_string(static_cast<int>(silent)) + " s";
+    problem_ = problem.str();
   }
-  ROS_WARN_STREAM_THROTTLE(10.0,
-                           "the camera gives no frame for " << static_cast<int>(silent) << " s");
+  ROS_WARN_STREAM_THROTTLE(10.0, problem.str());
 }
 
 void CameraDriver::takeRemarks() {
   for (const std::string& remark : camera_->takeRemarks()) {
     ROS_WARN_STREAM(printable(remark, 1000));
   }
+  for (const std::string& detail : camera_->takeDetails()) {
+    ROS_DEBUG_STREAM(printable(detail, 1000));
+  }
+}
+
+void CameraDriver::pollStatistics() {
+  if (Steady::now() < statistics_due_) return;
+  statistics_due_ = Steady::now() + kPollStatistics;
+  const device::CameraStatistics statistics = camera_->statistics();
+  const std::lock_guard<std::mutex> lock(mutex_);
+  statistics_ = statistics;
+}
+
+void CameraDriver::takeControls(const device::CameraControls& controls) {
+  // At most three frames may be missing, and the first comes after the exposure.
+  slowest_s_ = controls.exposure_us.value_or(0.0) * 2e-6;
+  const double rate = controls.frame_rate_hz.value_or(settings_.frame_rate_hz);
+  if (rate > 0.0) slowest_s_ = std::max(slowest_s_, 3.0 / rate);
+  const std::lock_guard<std::mutex> lock(mutex_);
+  controls_ = controls;
+  controls_changed_ = true;
+}
+
+void CameraDriver::callDevice(const Task& task) {
+  std::packaged_task<void(device::Camera*)> packaged(task);
+  std::future<void> done = packaged.get_future();
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (stop_) throw Error("the driver ends");
+    tasks_.push_back(std::move(packaged));
+  }
+  wake_.notify_all();
+  if (done.wait_for(kDeviceAnswers) != std::future_status::ready) {
+    throw Error("the camera is being opened, and takes its time");
+  }
+  try {
+    done.get();
+  } catch (const std::future_error&) {
+    throw Error("the driver ends");
+  }
+}
+
+void CameraDriver::runTasks() {
+  while (true) {
+    std::packaged_task<void(device::Camera*)> task;
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      if (tasks_.empty()) return;
+      task = std::move(tasks_.front());
+      tasks_.pop_front();
+    }
+    task(camera_.get());
+    if (camera_) takeRemarks();
+  }
+}
+
+bool CameraDriver::onTrigger(std_srvs::Trigger::Request& /*request*/,
+                             std_srvs::Trigger::Response& response) {
+  try {
+    callDevice([this](device::Camera* camera) {
+      if (!camera) throw device::CameraError("there is no camera now");
+      if (settings_.trigger != "software") {
+        throw device::CameraError("the parameter trigger is \"" + settings_.trigger +
+                                  "\", not \"software\"");
+      }
+      if (!streaming_) throw device::CameraError("nobody listens to the images");
+      camera->trigger();
+    });
+    response.success = true;
+  } catch (const std::exception& e) {
+    response.success = false;
+    response.message = e.what();
+  }
+  return true;
+}
+
+void CameraDriver::configure(CameraConfig& config) {
+  device::CameraControls wanted;
+  // What is as it was is not touched: it may be another's choice, or the device's own.
+  if (config.exposure_us > 0.0 && config.exposure_us != config_.exposure_us) {
+    wanted.exposure_us = config.exposure_us;
+  }
+  if (config.gain != config_.gain) wanted.gain = config.gain;
+  if (config.black_level != config_.black_level) wanted.black_level = config.black_level;
+  if (config.frame_rate > 0.0 && config.frame_rate != config_.frame_rate) {
+    wanted.frame_rate_hz = config.frame_rate;
+  }
+  if (config.exposure_auto != config_.exposure_auto) wanted.exposure_auto = config.exposure_auto;
+  if (config.gain_auto != config_.gain_auto) wanted.gain_auto = config.gain_auto;
+  try {
+    callDevice([this, wanted](device::Camera* camera) {
+      device::CameraControls taken = wanted;
+      if (camera) {
+        const device::CameraControls now = camera->setControls(wanted);
+        takeControls(now);
+        if (now.exposure_us) taken.exposure_us = now.exposure_us;
+        if (now.gain) taken.gain = now.gain;
+        if (now.black_level) taken.black_level = now.black_level;
+        if (now.frame_rate_hz) taken.frame_rate_hz = now.frame_rate_hz;
+      }
+      // A camera that comes back gets them again.
+      if (wanted.exposure_us) settings_.exposure_us = taken.exposure_us;
+      if (wanted.gain) settings_.gain = taken.gain;
+      if (wanted.black_level) settings_.black_level = taken.black_level;
+      if (wanted.frame_rate_hz) settings_.frame_rate_hz = *taken.frame_rate_hz;
+      if (!wanted.exposure_auto.empty()) settings_.exposure_auto = wanted.exposure_auto;
+      if (!wanted.gain_auto.empty()) settings_.gain_auto = wanted.gain_auto;
+    });
+    const std::lock_guard<std::mutex> lock(mutex_);
+    fromControls(controls_, &config);
+  } catch (const std::exception& e) {
+    ROS_WARN_STREAM("configuration: " << printable(e.what(), 1000));
+  }
+  config_ = config;
+}
+
+void CameraDriver::onTimer() {
+  bool opened = false;
+  bool changed = false;
+  device::CameraControls controls;
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    opened = opened_once_;
+    changed = std::exchange(controls_changed_, false);
+    controls = controls_;
+    if (opened) diagnostics_.setHardwareID(identity_.serial);
+  }
+  if (opened && !config_server_) {
+    // Not before there is a device: what is not known is not written to the parameters.
+    config_server_ =
+        std::make_unique<dynamic_reconfigure::Server<CameraConfig>>(config_mutex_, private_node_);
+    fromControls(controls, &config_);
+    config_server_->updateConfig(config_);
+    // The server calls back at once.
+    config_server_->setCallback([this](CameraConfig& config, std::uint32_t) {
+      if (config_ready_) configure(config);
+    });
+    config_ready_ = true;
+  } else if (changed && config_server_) {
+    const boost::recursive_mutex::scoped_lock lock(config_mutex_);
+    fromControls(controls, &config_);
+    config_server_->updateConfig(config_);
+  }
+  diagnostics_.update();
 }
 
 void CameraDriver::countLost(const device::Frame& frame) {
@@ -264,31 +508,53 @@ void CameraDriver::countLost(const device::Frame& frame) {
 }
 
 void CameraDriver::publish(const device::Frame& frame) {
-  const sensor_msgs::ImagePtr image = toImage(frame.image, frame.encoding);
+  const sensor_msgs::CameraInfoPtr info = infoFor(frame);
+  const sensor_msgs::ImagePtr image = toMessage(frame);
   image->header.stamp = toRosTime(frame.stamp);
   image->header.frame_id = parameters_.frame_id;
+  info->header = image->header;
+  publishRecordedStage(frame, image->header.stamp);
+  images_.publish(image, info);
+}
 
+sensor_msgs::CameraInfoPtr CameraDriver::infoFor(const device::Frame& frame) const {
   std::shared_ptr<const Lens> lens;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     lens = lens_;
   }
   auto info = boost::make_shared<sensor_msgs::CameraInfo>();
-  if (lens && lens->file.image_size == frame.image.size()) {
+  const cv::Size size = frame.image.size();
+  const bool part = frame.region && !frame.region->whole();
+  if (lens && lens->file.image_size == size) {
+    // Calibrated as it streams, a part of the sensor or not.
+    *info = lens->info;
+    return info;
+  }
+  if (lens && part && lens->file.image_size == frame.region->sensor) {
     *info = lens->info;
   } else {
-    *info = uncalibratedCameraInfo(frame.image.cols, frame.image.rows);
     if (lens) {
-      ROS_ERROR_STREAM_THROTTLE(30.0, "the lens is of "
-                                          << lens->file.image_size.width << "x"
-                                          << lens->file.image_size.height
-                                          << " pixels, the images have " << frame.image.cols << "x"
-                                          << frame.image.rows << ": published without calibration");
+      ROS_ERROR_STREAM_THROTTLE(30.0, "the lens is of " << lens->file.image_size.width << "x"
+                                                        << lens->file.image_size.height
+                                                        << " pixels, the images have " << size.width
+                                                        << "x" << size.height
+                                                        << ": published without calibration");
     }
+    const cv::Size whole = part ? frame.region->sensor : size;
+    *info = uncalibratedCameraInfo(whole.width, whole.height);
   }
-  info->header = image->header;
-  publishRecordedStage(frame, image->header.stamp);
-  images_.publish(image, info);
+  if (part) {
+    // REP 104: the calibration is of the whole sensor, the image a part of it.
+    const device::SensorRegion& region = *frame.region;
+    info->binning_x = static_cast<std::uint32_t>(region.binning.width);
+    info->binning_y = static_cast<std::uint32_t>(region.binning.height);
+    info->roi.x_offset = static_cast<std::uint32_t>(region.region.x);
+    info->roi.y_offset = static_cast<std::uint32_t>(region.region.y);
+    info->roi.width = static_cast<std::uint32_t>(region.region.width);
+    info->roi.height = static_cast<std::uint32_t>(region.region.height);
+  }
+  return info;
 }
 
 void CameraDriver::publishRecordedStage(const device::Frame& frame, const ros::Time& stamp) {
@@ -401,20 +667,31 @@ void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status)
   const double seconds = secondsSince(last_report_);
   const double rate =
       seconds > 0.0 ? static_cast<double>(frames_ - frames_at_last_report_) / seconds : 0.0;
+  const std::uint64_t lost = lost_ - lost_at_last_report_;
   frames_at_last_report_ = frames_;
+  lost_at_last_report_ = lost_;
   last_report_ = Steady::now();
   if (state_ == "lost" || state_ == "opening") {
     status.summary(DiagnosticStatus::ERROR, state_ == "lost" ? "no camera" : "opening the camera");
   } else if (!problem_.empty()) {
     status.summary(DiagnosticStatus::ERROR, problem_);
+  } else if (lost > 0) {
+    status.summary(DiagnosticStatus::WARN,
+                   "frames get lost: " + std::to_string(lost) + " just now");
   } else {
     status.summary(DiagnosticStatus::OK, state_);
   }
   status.add("state", state_);
   status.add("camera", describe(identity_));
+  status.add("link", printable(statistics_.link));
   status.add("frames published", frames_);
   status.add("frames lost", lost_);
   status.add("rate [Hz]", rate);
+  status.add("frames incomplete", statistics_.incomplete);
+  status.add("frames without memory", statistics_.underruns);
+  status.add("packets missing", statistics_.missing_packets);
+  status.add("packets sent again", statistics_.resent_packets);
+  if (statistics_.temperature_c) status.add("temperature [C]", *statistics_.temperature_c);
   status.add("failed attempts and losses of the device", losses_of_device_);
   status.add("last problem", printable(problem_));
   status.add("calibrated", lens_ ? "yes" : "no");

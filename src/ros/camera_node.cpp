@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <ros/callback_queue.h>
 #include <ros/ros.h>
 
 #include "omnister/ros/camera_driver.h"
@@ -7,9 +8,12 @@ int main(int argc, char** argv) {
   ros::init(argc, argv, "camera");
   try {
     const ros::NodeHandle private_node("~");
-    omnister::CameraDriver driver(ros::NodeHandle(), private_node,
-                                  omnister::loadCameraParameters(private_node));
-    ros::spin();
+    const omnister::CameraDriver driver(ros::NodeHandle(), private_node,
+                                        omnister::loadCameraParameters(private_node));
+    while (ros::ok() && !driver.failed()) {
+      ros::getGlobalCallbackQueue()->callAvailable(ros::WallDuration(0.1));
+    }
+    if (driver.failed()) return 1;
   } catch (const std::exception& e) {
     ROS_FATAL_STREAM(omnister::printable(e.what(), 1000));
     return 1;

@@ -7,7 +7,9 @@
 #include <atomic>
 #include <fstream>
 #include <future>
+#include <mutex>
 #include <opencv2/imgcodecs.hpp>
+#include <set>
 #include <thread>
 
 #include "omnister/lens/lens_models.h"
@@ -30,6 +32,10 @@ struct FakeState {
   std::atomic<bool> absent{false}, unplugged{false};
   std::atomic<std::uint64_t> sequence{0};
   std::atomic<std::uint64_t> skip{0};
+  std::shared_ptr<device::FramePool> pool;
+  std::optional<device::SensorRegion> region;
+  std::mutex mutex;
+  std::set<const std::uint8_t*> places;
 };
 
 class FakeCamera : public device::Camera {
@@ -45,7 +51,16 @@ class FakeCamera : public device::Camera {
     std::this_thread::sleep_for(milliseconds(5));
     if (state_->unplugged) throw device::CameraError("the cable is out");
     device::Frame frame;
-    frame.image = cv::Mat(6, 8, CV_8UC1, cv::Scalar(7));
+    if (state_->pool) {
+      frame.memory = state_->pool->take(6 * 8 + 16);  // the device sends more than the image
+      frame.image = cv::Mat(6, 8, CV_8UC1, frame.memory->bytes.data());
+      frame.image.setTo(7);
+      const std::lock_guard<std::mutex> lock(state_->mutex);
+      state_->places.insert(frame.image.data);
+    } else {
+      frame.image = cv::Mat(6, 8, CV_8UC1, cv::Scalar(7));
+    }
+    frame.region = state_->region;
     frame.encoding = "mono8";
     frame.stamp = device::now();
     frame.sequence = state_->sequence += 1 + state_->skip.exchange(0);
@@ -247,6 +262,51 @@ TEST_F(CameraTest, ALensOfAnotherImageSizeIsNotPublishedAsCalibration) {
   EXPECT_EQ(infos.last()->width, 8u);
 }
 
+TEST_F(CameraTest, APartOfTheSensorIsToldByRep104) {
+  // The lens is of the whole sensor, the image a binned part of it.
+  LensFile file = lens();
+  file.image_size = {32, 24};
+  parameters_.lens = (folder_.path() / "lens.yaml").string();
+  writeLensFile(parameters_.lens, file);
+  state_.region = device::SensorRegion{{32, 24}, {4, 6, 16, 12}, {2, 2}};
+  openFake();
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
+  const auto info = infos.last();
+  EXPECT_EQ(info->width, 32u);
+  EXPECT_EQ(info->height, 24u);
+  EXPECT_EQ(info->K, toCameraInfo(file).K);
+  EXPECT_NE(info->K[0], 0.0);
+  EXPECT_EQ(info->binning_x, 2u);
+  EXPECT_EQ(info->binning_y, 2u);
+  EXPECT_EQ(info->roi.x_offset, 4u);
+  EXPECT_EQ(info->roi.y_offset, 6u);
+  EXPECT_EQ(info->roi.width, 16u);
+  EXPECT_EQ(info->roi.height, 12u);
+}
+
+TEST_F(CameraTest, ImagesAreTheDevicesOwnMemoryWhichGoesRound) {
+  state_.pool = device::FramePool::make(8);
+  openFake();
+  // In this program messages go by pointer.
+  Collector<sensor_msgs::Image> images(node_, "image_raw", 2);
+  ASSERT_TRUE(eventually([&] { return images.size() >= 3; }));
+  const auto image = images.last();
+  ASSERT_EQ(image->data.size(), 48u);
+  EXPECT_EQ(image->data[47], 7);
+  EXPECT_EQ(image->step, 8u);
+  {
+    const std::lock_guard<std::mutex> lock(state_.mutex);
+    EXPECT_EQ(state_.places.count(image->data.data()), 1u);
+  }
+  images.shutdown();
+  const std::size_t held = images.size();
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() >= 20; }));
+  // Nobody holds the later images: they share a few places.
+  EXPECT_LE(state_.pool->allocated(), held + 8);
+}
+
 TEST_F(CameraTest, ABrokenLensParameterIsAnError) {
   parameters_.lens = (folder_.path() / "none.yaml").string();
   EXPECT_THROW(openFake(), Error);
@@ -369,7 +429,7 @@ TEST_F(CameraTest, RefusesParametersByKeyValueAndRange) {
               testing::AllOf(HasSubstr("frame_rate"), HasSubstr("-1"), HasSubstr("1000")));
   EXPECT_THAT(refusal("frame_rate", std::nan("")), HasSubstr("frame_rate"));
   EXPECT_THAT(refusal("frame_rate", "fast"), HasSubstr("fast"));
-  EXPECT_THAT(refusal("exposure_us", 0), HasSubstr("exposure_us"));
+  EXPECT_THAT(refusal("exposure_us", -1), HasSubstr("exposure_us"));
   EXPECT_THAT(refusal("trigger", "sometimes"), HasSubstr("software"));
   EXPECT_THAT(refusal("frame_id", "/camera"), HasSubstr("frame_id"));
   EXPECT_THAT(refusal("frame_id", ""), HasSubstr("frame_id"));

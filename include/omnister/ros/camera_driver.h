@@ -3,27 +3,34 @@
 ///
 /// Publishes `image_raw` and `camera_info` with identical headers (stamp: middle of the exposure),
 /// latched `lens_model`, `/diagnostics`, and the static frames of its mount. A lens that another
-/// node publishes on `lens_model` for our frame is taken over. The device is opened at once,
-/// streams only while someone listens, and is opened again when it was lost. A recording that knows
-/// stage positions also publishes `stage_state` and the stage's tf. What
-/// `set_camera_info` is given is kept in the store, as a lens surface.
+/// node publishes on `lens_model` for our frame is taken over. The device is opened at once by a
+/// thread of its own, streams only while someone listens, and is opened again when it was lost: the
+/// same camera, with the settings it had. What can change while it streams is changed by
+/// dynamic_reconfigure; `trigger` exposes once. A recording that knows stage positions also
+/// publishes `stage_state` and the stage's tf. What `set_camera_info` is given is kept in the
+/// store, as a lens surface.
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
+#include <dynamic_reconfigure/server.h>
 #include <image_transport/camera_publisher.h>
 #include <ros/node_handle.h>
 #include <sensor_msgs/SetCameraInfo.h>
+#include <std_srvs/Trigger.h>
 #include <tf2_ros/transform_broadcaster.h>
 
 #include <atomic>
 #include <condition_variable>
+#include <deque>
 #include <functional>
+#include <future>
 #include <memory>
 #include <mutex>
 #include <optional>
 #include <string>
 #include <thread>
 
+#include "omnister/CameraConfig.h"
 #include "omnister/common/pose.h"
 #include "omnister/device/camera.h"
 #include "omnister/lens/lens_file.h"
@@ -44,7 +51,8 @@ struct CameraParameters {
   std::string parent_frame_id;    ///< carries <camera>_link; empty: no static tf
   Pose mount = Pose::Identity();  ///< T_parent_link
   double retry_period_s = 1.0;    ///< between attempts to open the device
-  double watchdog_s = 2.0;        ///< without a frame: a warning
+  double watchdog_s = 1.5;        ///< a device without a frame for so long is lost
+  bool exit_on_error = false;     ///< the node ends instead of trying again
   // Of a recording that knows stage positions:
   std::string stage_frame_id = "stage_base";
   std::string stage_child_frame_id = "stage_carriage";
@@ -70,7 +78,11 @@ class CameraDriver {
   CameraDriver(const CameraDriver&) = delete;
   CameraDriver& operator=(const CameraDriver&) = delete;
 
+  /// The device could not be opened or was lost, and the parameters say that the node ends then.
+  bool failed() const { return failed_; }
+
  private:
+  using Task = std::function<void(device::Camera*)>;
   struct Lens {
     LensFile file;
     sensor_msgs::CameraInfo info;
@@ -79,15 +91,28 @@ class CameraDriver {
 
   void run();
   void stream();
-  bool openIfNeeded();
+  void openIfNeeded();
   void close(const std::string& problem);
   bool wanted() const;
   void waitFor(double seconds);
   void publish(const device::Frame& frame);
+  sensor_msgs::CameraInfoPtr infoFor(const device::Frame& frame) const;
   void publishRecordedStage(const device::Frame& frame, const ros::Time& stamp);
   void takeRemarks();
   void countLost(const device::Frame& frame);
+  /// @throws CameraError for a device that has been silent for too long
   void watch();
+  void pollStatistics();
+  /// Has the device thread do something between two frames, and waits for it.
+  /// @throws Error where it cannot be done now
+  void callDevice(const Task& task);
+  void runTasks();
+
+  /// What must not wait for the device: diagnostics, and the configuration as the device took it.
+  void onTimer();
+  void configure(CameraConfig& config);
+  bool onTrigger(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
+  void takeControls(const device::CameraControls& controls);
 
   void chooseLens();
   void setLens(LensFile file);
@@ -113,11 +138,21 @@ class CameraDriver {
   std::uint64_t lost_ = 0;
   std::uint64_t losses_of_device_ = 0;
   std::uint64_t frames_at_last_report_ = 0;
+  std::uint64_t lost_at_last_report_ = 0;
+  device::CameraStatistics statistics_;
+  device::CameraControls controls_;
+  bool opened_once_ = false;
+  bool controls_changed_ = false;
+  std::deque<std::packaged_task<void(device::Camera*)>> tasks_;
   std::chrono::steady_clock::time_point last_report_;
 
   // Of the device thread.
   std::unique_ptr<device::Camera> camera_;
+  device::CameraSettings settings_;
   bool streaming_ = false;
+  bool streamed_ = false;   // a frame came since it was started
+  double slowest_s_ = 0.0;  // as long as the device itself may take for a frame
+  std::chrono::steady_clock::time_point statistics_due_;
   std::optional<std::uint64_t> last_sequence_;
   std::chrono::steady_clock::time_point last_frame_;
   ros::Time recorded_stamp_;
@@ -131,8 +166,16 @@ class CameraDriver {
   ros::Publisher stage_publisher_;
   ros::Subscriber lens_subscriber_;
   ros::ServiceServer set_camera_info_;
+  ros::ServiceServer trigger_;
+  ros::NodeHandle private_node_;
+  boost::recursive_mutex config_mutex_;
+  std::unique_ptr<dynamic_reconfigure::Server<CameraConfig>> config_server_;  // of the timer
+  CameraConfig config_;                                                       // as it was last told
+  bool config_ready_ = false;
+  ros::WallTimer timer_;
   diagnostic_updater::Updater diagnostics_;
   std::atomic<bool> stop_{false};
+  std::atomic<bool> failed_{false};
   std::thread thread_;
 };
 

@@ -1,0 +1,153 @@
+// SPDX-License-Identifier: Apache-2.0
+// The camera driver on a GigE Vision camera that goes away and comes back.
+#include <dynamic_reconfigure/Reconfigure.h>
+#include <gmock/gmock.h>
+#include <rosgraph_msgs/Log.h>
+#include <std_srvs/Trigger.h>
+
+#include "child_process.h"
+#include "omnister/ros/camera_driver.h"
+#include "omnister/sim/gige_server.h"
+#include "ros/ros_test.h"
+#include "temporary_folder.h"
+
+namespace omnister {
+namespace {
+
+using test::Collector;
+using test::eventually;
+using testing::HasSubstr;
+
+constexpr double kLong = 60.0;
+
+class AravisDriver : public testing::Test {
+ protected:
+  AravisDriver()
+      : node_("gige_" + std::to_string(++count_)), private_("~" + node_.getNamespace().substr(1)) {
+    options_.serial = "R-1";
+    options_.size = {64, 48};
+    options_.frame_rate_hz = 50.0;
+    parameters_.store = (folder_.path() / "store").string();
+    parameters_.retry_period_s = 0.2;
+    parameters_.device = "aravis:R-1";
+  }
+  void serve() {
+    server_ = std::make_unique<sim::GigeServer>(
+        options_, [](device::Stamp) { return cv::Mat(48, 64, CV_8UC1, cv::Scalar(9)); });
+  }
+  void drive() { driver_ = std::make_unique<CameraDriver>(node_, private_, parameters_); }
+
+  /// @return the configuration as the node tells it
+  dynamic_reconfigure::Config configure(const std::string& key, double value) {
+    ros::ServiceClient client =
+        private_.serviceClient<dynamic_reconfigure::Reconfigure>("set_parameters");
+    EXPECT_TRUE(client.waitForExistence(ros::Duration(kLong)));
+    dynamic_reconfigure::Reconfigure call;
+    dynamic_reconfigure::DoubleParameter parameter;
+    parameter.name = key;
+    parameter.value = value;
+    call.request.config.doubles.push_back(parameter);
+    EXPECT_TRUE(client.call(call));
+    return call.response.config;
+  }
+  static double number(const dynamic_reconfigure::Config& config, const std::string& key) {
+    for (const auto& entry : config.doubles) {
+      if (entry.name == key) return entry.value;
+    }
+    return std::nan("");
+  }
+
+  static int count_;
+  ros::NodeHandle node_, private_;
+  test::TemporaryFolder folder_;
+  sim::GigeServerOptions options_;
+  CameraParameters parameters_;
+  std::unique_ptr<sim::GigeServer> server_;
+  std::unique_ptr<CameraDriver> driver_;  // goes first
+};
+int AravisDriver::count_ = 0;
+
+TEST_F(AravisDriver, LiveValuesAreWrittenBackAsTheCameraTookThemAndSurviveALoss) {
+  parameters_.settings.trigger = "off";
+  drive();
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  Collector<rosgraph_msgs::Log> log(ros::NodeHandle(), "/rosout");
+  // Absent at start.
+  serve();
+  ASSERT_TRUE(eventually([&] { return images.size() >= 3; }, kLong));
+  EXPECT_EQ(images.last()->encoding, "bgr8");
+  EXPECT_EQ(images.last()->data.at(0), 9);
+
+  EXPECT_EQ(number(configure("exposure_us", 3000.0), "exposure_us"), 3000.0);
+  const dynamic_reconfigure::Config taken = configure("gain", 500.0);
+  EXPECT_EQ(number(taken, "gain"), 24.0);
+  EXPECT_EQ(number(taken, "exposure_us"), 3000.0);
+  EXPECT_NEAR(number(taken, "frame_rate"), 50.0, 1e-6);
+  double stored = 0.0;
+  EXPECT_TRUE(eventually([&] { return private_.getParam("gain", stored) && stored == 24.0; }));
+
+  for (int round = 0; round < 2; ++round) {
+    server_.reset();
+    ASSERT_TRUE(eventually(
+        [&] {
+          for (const auto& line : log.messages()) {
+            if (line->level == rosgraph_msgs::Log::WARN &&
+                line->msg.find("no frame for") != std::string::npos) {
+              return true;
+            }
+          }
+          return false;
+        },
+        kLong));
+    const std::size_t had = images.size();
+    serve();
+    ASSERT_TRUE(eventually([&] { return images.size() > had + 3; }, kLong));
+  }
+  // It was powered down, and yet has its settings.
+  const dynamic_reconfigure::Config again = configure("black_level", 1.0);
+  EXPECT_EQ(number(again, "exposure_us"), 3000.0);
+  EXPECT_EQ(number(again, "gain"), 24.0);
+}
+
+TEST_F(AravisDriver, ATriggerIsAService) {
+  serve();
+  parameters_.device = "aravis:127.0.0.1";
+  parameters_.settings.trigger = "software";
+  drive();
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  ros::ServiceClient client = node_.serviceClient<std_srvs::Trigger>("trigger");
+  std_srvs::Trigger call;
+  ASSERT_TRUE(eventually([&] { return client.call(call) && call.response.success; }, kLong));
+  ASSERT_TRUE(eventually([&] { return images.size() == 1; }, kLong));
+  ASSERT_TRUE(client.call(call));
+  EXPECT_TRUE(call.response.success) << call.response.message;
+  ASSERT_TRUE(eventually([&] { return images.size() == 2; }, kLong));
+}
+
+TEST_F(AravisDriver, DiagnosticsTellOfTheLink) {
+  serve();
+  parameters_.device = "aravis:127.0.0.1";
+  drive();
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  Collector<diagnostic_msgs::DiagnosticArray> diagnostics(ros::NodeHandle(), "/diagnostics");
+  const auto value = [&](const std::string& key) -> std::string {
+    std::string found;
+    for (const auto& array : diagnostics.messages()) {
+      for (const auto& status : array->status) {
+        if (status.hardware_id != "R-1") continue;
+        for (const auto& entry : status.values) {
+          if (entry.key == key) found = entry.value;
+        }
+      }
+    }
+    return found;
+  };
+  EXPECT_TRUE(eventually([&] { return value("temperature [C]") == "41"; }, kLong));
+  EXPECT_THAT(value("link"), HasSubstr("127.0.0.1"));
+  EXPECT_EQ(value("frames incomplete"), "0");
+}
+
+}  // namespace
+}  // namespace omnister
+
+int main(int argc, char** argv) { return omnister::test::runTests(argc, argv, "aravis_test"); }
