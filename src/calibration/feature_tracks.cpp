@@ -12,6 +12,7 @@
 
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
+#include "picture_mask.h"
 
 namespace omnister {
 namespace {
@@ -39,13 +40,14 @@ struct ScanFeatures {
 
 /// The strongest SIFT keypoints of every cell that are corners too: Lucas-Kanade cannot hold a blob
 /// on a straight edge.
-std::vector<cv::KeyPoint> spreadKeypoints(const cv::Mat& image, int wanted) {
+std::vector<cv::KeyPoint> spreadKeypoints(const cv::Mat& image, const cv::Mat1b& inside,
+                                          int wanted) {
   std::vector<cv::KeyPoint> all;
-  cv::SIFT::create(0, 3, 0.02)->detect(image, all);
+  cv::SIFT::create(0, 3, 0.02)->detect(image, all, inside);
   cv::Mat corners;
   cv::cornerMinEigenVal(image, corners, 7);
   double strongest = 0.0;
-  cv::minMaxLoc(corners, nullptr, &strongest);
+  cv::minMaxLoc(corners, nullptr, &strongest, nullptr, nullptr, inside);
   const auto cornerness = [&](const cv::KeyPoint& k) {
     return corners.at<float>(std::clamp(cvRound(k.pt.y), 0, image.rows - 1),
                              std::clamp(cvRound(k.pt.x), 0, image.cols - 1));
@@ -107,7 +109,7 @@ std::vector<std::optional<cv::Point2f>> follow(const std::vector<cv::Mat>& refer
   return found;
 }
 
-ScanFeatures trackScan(const StageScan& scan, int wanted) {
+ScanFeatures trackScan(const StageScan& scan, const cv::Mat1b& inside, int wanted) {
   const std::size_t count = scan.images.size();
   std::vector<std::size_t> order(count);
   std::iota(order.begin(), order.end(), std::size_t{0});
@@ -123,7 +125,7 @@ ScanFeatures trackScan(const StageScan& scan, int wanted) {
   const cv::Mat reference = gray(scan.images[order[middle]]);
 
   ScanFeatures features;
-  features.keypoints = spreadKeypoints(reference, wanted);
+  features.keypoints = spreadKeypoints(reference, inside, wanted);
   if (!features.keypoints.empty()) {
     cv::SIFT::create()->compute(reference, features.keypoints, features.descriptors);
   }
@@ -155,7 +157,7 @@ ScanFeatures trackScan(const StageScan& scan, int wanted) {
       const auto found = follow(pyramids[order[middle]], pyramids[order[i]], from, guess);
       std::vector<std::size_t> next;
       for (std::size_t k = 0; k < alive.size(); ++k) {
-        if (!found[k]) continue;
+        if (!found[k] || inside(cvRound(found[k]->y), cvRound(found[k]->x)) == 0) continue;
         const std::size_t f = alive[k];
         features.pixels[f][order[i]] = *found[k];
         step[f] = *found[k] - last[f];
@@ -230,8 +232,10 @@ FeatureTracks trackFeatures(const std::vector<StageScan>& scans, const TrackingO
   std::vector<ScanFeatures> features(scans.size());
   const std::string stage = "following features";
   if (progress) progress(0.0, stage);
-  parallelFor(0, scans.size(), options.threads,
-              [&](std::size_t s) { features[s] = trackScan(scans[s], options.features_per_scan); });
+  const cv::Mat1b inside = ~calibration::outsidePicture(scans, kWindow.width / 2 + 2);
+  parallelFor(0, scans.size(), options.threads, [&](std::size_t s) {
+    features[s] = trackScan(scans[s], inside, options.features_per_scan);
+  });
   if (progress) progress(1.0, stage);
 
   std::vector<std::vector<int>> track_of(scans.size());

@@ -10,6 +10,7 @@
 
 #include "board_pose.h"
 #include "bundle.h"
+#include "guided_tracks.h"
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
 #include "omnister/lens/lens_fit.h"
@@ -352,6 +353,305 @@ std::string degrees(double radians) {
   return text;
 }
 
+/// A scene that has been put together, before its last adjustment.
+struct Reconstruction {
+  ScanData data;
+  ScanEstimate estimate;
+  std::vector<int> point_of;  ///< [track] index of its point; -1 where it was dropped
+  std::vector<bool> joined;   ///< [scan]
+  std::vector<std::string> warnings;
+
+  bool severalScans() const { return std::count(joined.begin(), joined.end(), true) > 1; }
+};
+
+void adjustOrThrow(Reconstruction& scene, double loss_px, bool scans, int threads) {
+  AdjustOptions options;
+  options.threads = threads;
+  options.loss_px = loss_px;
+  options.scans = scans;
+  if (!adjust(scene.data, options, scene.estimate)) {
+    throw Error("the adjustment of lens, axis and scene did not converge");
+  }
+}
+
+/// Reaches out to the farthest observation and some pixels beyond.
+void fitField(Reconstruction& scene, double margin_px) {
+  const LensModel& lens = *scene.estimate.lens;
+  double field = largestAngle(scene.data.observations, scene.estimate);
+  // The slope out there, not that on the axis: it may be half of it.
+  const auto radius = [&](double theta) {
+    const auto pixel =
+        projectContinued(lens, Eigen::Vector3d(std::sin(theta), 0.0, std::cos(theta)));
+    return pixel ? (*pixel - lens.center()).norm() : 0.0;
+  };
+  const double slope = (radius(field) - radius(field - 0.02)) / 0.02;
+  if (slope > 0.0) field += std::min(margin_px / slope, 0.2);
+  field = std::min(field, M_PI - 0.05);
+  if (auto fitted = lens.withParameters(lens.parameters(), field)) scene.estimate.lens = fitted;
+}
+
+/// Where residuals stop counting in full [px]: a few times the noise.
+double lossOf(const Reconstruction& scene) {
+  return std::clamp(4.0 * noiseOf(scene.data.observations, scene.estimate), 0.08, 0.5);
+}
+
+/// A part of the points with all their observations.
+Reconstruction sampled(const Reconstruction& scene, std::size_t points) {
+  const std::size_t stride = std::max<std::size_t>(1, scene.estimate.points.size() / points);
+  Reconstruction result = scene;
+  result.data.observations.clear();
+  result.estimate.points.clear();
+  for (std::size_t p = 0; p < scene.estimate.points.size(); p += stride) {
+    result.estimate.points.push_back(scene.estimate.points[p]);
+  }
+  for (ScanObservation o : scene.data.observations) {
+    if (o.point % stride != 0) continue;
+    o.point /= static_cast<int>(stride);
+    result.data.observations.push_back(o);
+  }
+  result.point_of.clear();
+  return result;
+}
+
+/// Gives the lens what the observations ask for beyond its structure: a further even term or a
+/// radial spline, and, where scans from several directions make them observable, affinity and
+/// decentring. Taken is what lowers the robust sum of squares by far more than chance would.
+void growStructure(Reconstruction& scene, bool scale_known, int threads) {
+  Reconstruction part = sampled(scene, 700);
+  const double sigma = noiseOf(part.data.observations, part.estimate);
+  const double loss = lossOf(part);
+  const auto chiSquared = [&](Reconstruction& trial) -> std::optional<double> {
+    AdjustOptions options;
+    options.threads = threads;
+    options.loss_px = loss;
+    options.scans = true;
+    const auto cost = adjust(trial.data, options, trial.estimate);
+    if (!cost) return std::nullopt;
+    return 2.0 * *cost * static_cast<double>(trial.data.observations.size()) / (sigma * sigma);
+  };
+  auto least = chiSquared(part);
+  if (!least) return;
+  const double observations = static_cast<double>(part.data.observations.size());
+  for (;;) {
+    const LensStructure now = structureOf(*part.estimate.lens);
+    std::vector<LensStructure> candidates;
+    if (now.model == "asphere" && now.even_terms < 3) {
+      candidates.push_back(now);
+      ++candidates.back().even_terms;
+    } else if (now.model == "asphere") {
+      // Some lenses turn up at the rim as no compact surface does.
+      candidates.push_back(now);
+      candidates.back().model = "spline";
+      candidates.back().even_terms = 0;
+      candidates.back().knots = 12;
+    }
+    if (scale_known && part.severalScans()) {
+      if (!now.affinity) {
+        candidates.push_back(now);
+        candidates.back().affinity = true;
+      }
+      if (now.model != "conic" && !now.decentring) {
+        candidates.push_back(now);
+        candidates.back().decentring = true;
+      }
+    }
+    std::optional<Reconstruction> best;
+    double best_value = *least;
+    for (const LensStructure& candidate : candidates) {
+      Reconstruction trial = part;
+      try {
+        trial.estimate.lens = refit(*part.estimate.lens, candidate);
+      } catch (const Error&) {
+        continue;
+      }
+      const auto value = chiSquared(trial);
+      const double further = static_cast<double>(trial.estimate.lens->parameters().size() -
+                                                 part.estimate.lens->parameters().size());
+      // Four times Schwarz' criterion: errors of one feature are alike in several images.
+      if (!value || *least - *value < 4.0 * further * std::log(observations)) continue;
+      if (*value < best_value) {
+        best_value = *value;
+        best = std::move(trial);
+      }
+    }
+    if (!best) break;
+    part = std::move(*best);
+    least = best_value;
+  }
+  scene.estimate.lens = part.estimate.lens;
+  scene.estimate.axis = part.estimate.axis;
+  scene.estimate.T_scan = part.estimate.T_scan;
+  scene.estimate.T_camera_board = part.estimate.T_camera_board;
+}
+
+/// The last adjustments: with the scale of the surface free if anything fixes it, held otherwise.
+/// @param settled the scene comes from an adjustment like this one
+TargetFreeResult conclude(Reconstruction& scene, const FeatureTracks& tracks,
+                          const TargetFreeOptions& options, bool settled) {
+  const int threads = threadCount(options.threads);
+  const std::string stage = settled ? "adjusting again" : "adjusting";
+  ScanData& data = scene.data;
+  ScanEstimate& estimate = scene.estimate;
+  const bool several = scene.severalScans();
+  data.pinned_slope = axisSlope(*estimate.lens);
+  data.known_angle = options.known_angle;
+  estimate.T_camera_board.clear();
+  if (!options.boards.views.empty()) {
+    data.boards = &options.boards;
+    for (const ViewDetections& view : options.boards.views) {
+      const auto pose = boardPose(view, *estimate.lens);
+      if (!pose) {
+        throw InputError(view.name, "", "the board lies outside the field that the features cover");
+      }
+      estimate.T_camera_board.push_back(*pose);
+    }
+  }
+  report(options, 0.6, stage);
+  const bool other_information = several || data.known_angle || data.boards != nullptr;
+  // First with the scale held, so that poses and points settle; then free, if anything may fix it.
+  if (!settled && (several || data.boards != nullptr)) {
+    if (!data.known_angle) adjustOrThrow(scene, 3.0, true, threads);
+    prune(data.observations, estimate, 2.0, &scene.point_of);
+  }
+  if (settled) {
+    adjustOrThrow(scene, 0.5, true, threads);
+    prune(data.observations, estimate, 0.5, &scene.point_of);
+    if (estimate.points.size() < 50) {
+      throw Error("only " + std::to_string(estimate.points.size()) +
+                  " features could be measured again, expected 50 or more");
+    }
+  }
+  const auto sigmaOfScale = [&](double noise_px) {
+    const Eigen::MatrixXd covariance = lensCovariance(data, estimate, several);
+    Eigen::RowVectorXd gradient;
+    const double slope = axisSlope(*estimate.lens, &gradient);
+    return noise_px / slope *
+           std::sqrt(std::max(0.0, (gradient * covariance * gradient.transpose())(0)));
+  };
+  const auto noise = [&] { return noiseOf(data.observations, estimate); };
+  const std::optional<double> pin = data.pinned_slope;
+  bool known = false;
+  if (other_information) {
+    known = data.known_angle.has_value() || sigmaOfScale(noise()) < kScaleKnown;
+    if (known) data.pinned_slope.reset();
+  }
+  adjustOrThrow(scene, settled ? lossOf(scene) : 1.0, true, threads);
+  if (settled && options.grow) growStructure(scene, known, threads);
+  prune(data.observations, estimate, settled ? 0.3 : 1.0, &scene.point_of);
+  fitField(scene, 5.0);
+  report(options, 0.8, stage);
+  adjustOrThrow(scene, lossOf(scene), true, threads);
+  if (known && !data.known_angle && sigmaOfScale(noise()) >= kScaleKnown) {
+    known = false;
+    data.pinned_slope = pin;
+    adjustOrThrow(scene, lossOf(scene), true, threads);
+  }
+  report(options, 1.0, stage);
+
+  TargetFreeResult result;
+  result.joined = scene.joined;
+  result.scan_warnings = scene.warnings;
+  result.warnings = scene.warnings;
+  result.scale_sigma =
+      other_information ? sigmaOfScale(noise()) : std::numeric_limits<double>::infinity();
+  if (known) {
+    result.scale = data.known_angle         ? SurfaceScale::kKnownAngle
+                   : data.boards != nullptr ? SurfaceScale::kBoard
+                                            : SurfaceScale::kRotatedScans;
+  } else {
+    result.scale_sigma = std::numeric_limits<double>::infinity();
+    if (several) {
+      double turn = 0.0;
+      for (std::size_t k = 0; k < estimate.T_scan.size(); ++k) {
+        const Eigen::Vector3d axis = estimate.T_scan[k].linear().col(2);
+        turn = std::max(turn, std::acos(std::clamp(axis.z(), -1.0, 1.0)));
+      }
+      result.warnings.push_back(
+          "the scans look along axes that differ by " + degrees(turn) +
+          " degrees at most, too little to fix the scale of the surface: turn "
+          "the rig by 15 degrees or more, not about the optical axis");
+    }
+    if (data.boards != nullptr) {
+      result.warnings.push_back(
+          "the board is too square to the axis to fix the scale of the surface: "
+          "tilt it by 20 degrees or more");
+    }
+    result.warnings.push_back(
+        "the surface is known up to one scale only (rays (x, y, c h), c unknown): "
+        "this lens is not metric");
+  }
+
+  double squares = 0.0;
+  for (const ScanObservation& o : data.observations) {
+    if (o.weight < 1.0) continue;
+    const double r = residualOf(o, estimate);
+    squares += r * r;
+    ++result.observations;
+  }
+  result.points = static_cast<int>(estimate.points.size());
+  result.rms_px = std::sqrt(squares / std::max(1, result.observations));
+  // The windows were seen that far out.
+  fitField(scene, settled ? kGuidedHalf : 0.0);
+  for (const Pose& pose : estimate.T_scan) result.T_first_scan.push_back(pose.inverse());
+  result.file.image_size = tracks.image_size;
+  result.file.lens = estimate.lens;
+  result.file.stage_axis = estimate.axis;
+  result.file.calibration.rms_px = result.rms_px;
+  result.file.calibration.points = result.points;
+  if (known) {
+    const double sigma = noise();
+    result.file.covariance = sigma * sigma * lensCovariance(data, estimate, several);
+  }
+  result.track_points.resize(scene.point_of.size());
+  for (std::size_t t = 0; t < scene.point_of.size(); ++t) {
+    if (scene.point_of[t] >= 0) result.track_points[t] = estimate.points[scene.point_of[t]];
+  }
+  return result;
+}
+
+/// Measures all features again through the lens that is known by now, and adjusts anew.
+TargetFreeResult refine(const std::vector<StageScan>& scans, const FeatureTracks& tracks,
+                        const TargetFreeResult& first, const TargetFreeOptions& options) {
+  KnownScene known;
+  known.lens = first.file.lens;
+  // Windows reach beyond the farthest point that was followed.
+  {
+    const double field = std::min(known.lens->maxTheta() + 0.1, M_PI - 0.05);
+    if (auto wider = known.lens->withParameters(known.lens->parameters(), field)) {
+      known.lens = wider;
+    }
+  }
+  known.axis = *first.file.stage_axis;
+  known.joined = first.joined;
+  known.points = first.track_points;
+  for (const Pose& pose : first.T_first_scan) known.T_scan.push_back(pose.inverse());
+  report(options, 0.0, "measuring through the lens");
+  const FeatureTracks measured = measureGuided(scans, tracks, known, options.threads);
+  report(options, 1.0, "measuring through the lens");
+  Reconstruction scene;
+  scene.joined = first.joined;
+  scene.warnings = first.scan_warnings;
+  scene.estimate.lens = known.lens;
+  scene.estimate.axis = known.axis;
+  scene.estimate.T_scan = known.T_scan;
+  scene.point_of.assign(measured.tracks.size(), -1);
+  for (std::size_t t = 0; t < measured.tracks.size(); ++t) {
+    if (measured.tracks[t].observations.empty()) continue;
+    scene.point_of[t] = static_cast<int>(scene.estimate.points.size());
+    scene.estimate.points.push_back(*first.track_points[t]);
+    for (const auto& seen : measured.tracks[t].observations) {
+      scene.data.observations.push_back(
+          {scene.point_of[t], seen.scan, measured.positions_m[seen.scan][seen.image], seen.pixel});
+    }
+  }
+  if (scene.estimate.points.size() < 50) {
+    throw Error("only " + std::to_string(scene.estimate.points.size()) +
+                " features could be measured again, expected 50 or more");
+  }
+  fitField(scene, 5.0);
+  return conclude(scene, tracks, options, true);
+}
+
 }  // namespace
 
 LensPtr scaleSurface(const LensModel& lens, double c) {
@@ -380,12 +680,14 @@ TargetFreeResult calibrateTargetFree(const FeatureTracks& tracks,
                                      const TargetFreeOptions& options) {
   const int threads = threadCount(options.threads);
   const std::string stage = "adjusting";
-  ScanData data;
-  ScanEstimate estimate;
+  Reconstruction scene;
+  ScanData& data = scene.data;
+  ScanEstimate& estimate = scene.estimate;
+  std::vector<int>& point_of = scene.point_of;
   estimate.T_scan.assign(tracks.positions_m.size(), Pose::Identity());
 
   // Every track is a point of its own scan's scene at first.
-  std::vector<int> point_of(tracks.tracks.size(), -1);
+  point_of.assign(tracks.tracks.size(), -1);
   double farthest = 0.0;
   const Eigen::Vector2d middle(0.5 * (tracks.image_size.width - 1),
                                0.5 * (tracks.image_size.height - 1));
@@ -493,32 +795,17 @@ TargetFreeResult calibrateTargetFree(const FeatureTracks& tracks,
     data.observations = std::move(kept);
   }
   report(options, 0.2, stage);
-  AdjustOptions adjustment;
-  adjustment.threads = threads;
-  const auto adjustOrThrow = [&](double loss_px, bool scans) {
-    adjustment.loss_px = loss_px;
-    adjustment.scans = scans;
-    if (!adjust(data, adjustment, estimate)) {
-      throw Error("the adjustment of lens, axis and scene did not converge");
-    }
-  };
-  adjustOrThrow(2.0, false);
+  adjustOrThrow(scene, 2.0, false, threads);
   prune(data.observations, estimate, 3.0, &point_of);
-  const auto widen = [&](double margin) {
-    const double field = std::min(largestAngle(data.observations, estimate) * margin, M_PI - 0.05);
-    if (auto lens = estimate.lens->withParameters(estimate.lens->parameters(), field)) {
-      estimate.lens = lens;
-    }
-  };
-  widen(1.01);
+  fitField(scene, 5.0);
   if (!(structureOf(*estimate.lens).model == options.structure.model &&
         options.structure.model == "conic")) {
     estimate.lens = refit(*estimate.lens, options.structure);
     data.pinned_slope = axisSlope(*estimate.lens);
   }
-  adjustOrThrow(1.0, false);
+  adjustOrThrow(scene, 1.0, false, threads);
   prune(data.observations, estimate, 1.0, &point_of);
-  adjustOrThrow(0.5, false);
+  adjustOrThrow(scene, 0.5, false, threads);
   if (estimate.points.size() < 50) {
     throw Error(
         "only " + std::to_string(estimate.points.size()) +
@@ -527,9 +814,8 @@ TargetFreeResult calibrateTargetFree(const FeatureTracks& tracks,
   }
   report(options, 0.5, stage);
 
-  TargetFreeResult result;
-  result.joined.assign(tracks.positions_m.size(), false);
-  result.joined[0] = true;
+  scene.joined.assign(tracks.positions_m.size(), false);
+  scene.joined[0] = true;
 
   // Join the scans: an affine map of scene to scene, of which the one scale c makes a rotation.
   struct Joint {
@@ -548,10 +834,10 @@ TargetFreeResult calibrateTargetFree(const FeatureTracks& tracks,
   for (bool grown = true; grown;) {
     grown = false;
     Joint strongest;
-    for (std::size_t k = 0; k < result.joined.size(); ++k) {
-      if (result.joined[k]) continue;
-      for (std::size_t j = 0; j < result.joined.size(); ++j) {
-        if (!result.joined[j]) continue;
+    for (std::size_t k = 0; k < scene.joined.size(); ++k) {
+      if (scene.joined[k]) continue;
+      for (std::size_t j = 0; j < scene.joined.size(); ++j) {
+        if (!scene.joined[j]) continue;
         Joint joint;
         joint.scan = static_cast<int>(k);
         joint.from = static_cast<int>(j);
@@ -568,15 +854,15 @@ TargetFreeResult calibrateTargetFree(const FeatureTracks& tracks,
       }
     }
     if (strongest.fit.inliers.size() >= static_cast<std::size_t>(kLeastShared)) {
-      result.joined[strongest.scan] = true;
+      scene.joined[strongest.scan] = true;
       joints.push_back(std::move(strongest));
       grown = true;
     }
   }
-  for (std::size_t k = 1; k < result.joined.size(); ++k) {
-    if (!result.joined[k]) {
-      result.warnings.push_back("scan " + std::to_string(k + 1) +
-                                " shares too few points with the others to be joined to them");
+  for (std::size_t k = 1; k < scene.joined.size(); ++k) {
+    if (!scene.joined[k]) {
+      scene.warnings.push_back("scan " + std::to_string(k + 1) +
+                               " shares too few points with the others to be joined to them");
     }
   }
 
@@ -645,104 +931,18 @@ TargetFreeResult calibrateTargetFree(const FeatureTracks& tracks,
   }
   data.observations.insert(data.observations.end(), matched.begin(), matched.end());
 
-  data.known_angle = options.known_angle;
-  if (!options.boards.views.empty()) {
-    data.boards = &options.boards;
-    for (const ViewDetections& view : options.boards.views) {
-      const auto pose = boardPose(view, *estimate.lens);
-      if (!pose) {
-        throw InputError(view.name, "", "the board lies outside the field that the features cover");
-      }
-      estimate.T_camera_board.push_back(*pose);
-    }
-  }
-  report(options, 0.6, stage);
-  const bool other_information =
-      !joints.empty() || data.known_angle.has_value() || data.boards != nullptr;
-  // First with the scale held, so that poses and points settle; then free, if anything may fix it.
-  if (!joints.empty() || data.boards != nullptr) {
-    if (!data.known_angle) adjustOrThrow(3.0, true);
-    prune(data.observations, estimate, 2.0);
-  }
-  const std::optional<double> pin = data.pinned_slope;
-  const auto sigmaOfScale = [&](double noise_px) {
-    const Eigen::MatrixXd covariance = lensCovariance(data, estimate, !joints.empty());
-    Eigen::RowVectorXd gradient;
-    const double slope = axisSlope(*estimate.lens, &gradient);
-    return noise_px / slope *
-           std::sqrt(std::max(0.0, (gradient * covariance * gradient.transpose())(0)));
-  };
-  const auto noise = [&] { return noiseOf(data.observations, estimate); };
-  bool known = false;
-  if (other_information) {
-    known = data.known_angle.has_value() || sigmaOfScale(noise()) < kScaleKnown;
-    if (known) data.pinned_slope.reset();
-  }
-  adjustOrThrow(1.0, true);
-  prune(data.observations, estimate, 1.0);
-  widen(1.01);
-  report(options, 0.8, stage);
-  adjustOrThrow(0.5, true);
-  if (known && !data.known_angle && sigmaOfScale(noise()) >= kScaleKnown) {
-    known = false;
-    data.pinned_slope = pin;
-    adjustOrThrow(0.5, true);
-  }
-  report(options, 1.0, stage);
+  return conclude(scene, tracks, options, false);
+}
 
-  result.scale_sigma =
-      other_information ? sigmaOfScale(noise()) : std::numeric_limits<double>::infinity();
-  if (known) {
-    result.scale = data.known_angle         ? SurfaceScale::kKnownAngle
-                   : data.boards != nullptr ? SurfaceScale::kBoard
-                                            : SurfaceScale::kRotatedScans;
-  } else {
-    result.scale_sigma = std::numeric_limits<double>::infinity();
-    if (!joints.empty()) {
-      double turn = 0.0;
-      for (std::size_t k = 0; k < estimate.T_scan.size(); ++k) {
-        const Eigen::Vector3d axis = estimate.T_scan[k].linear().col(2);
-        turn = std::max(turn, std::acos(std::clamp(axis.z(), -1.0, 1.0)));
-      }
-      result.warnings.push_back(
-          "the scans look along axes that differ by " + degrees(turn) +
-          " degrees at most, too little to fix the scale of the surface: turn "
-          "the rig by 15 degrees or more, not about the optical axis");
-    }
-    if (data.boards != nullptr) {
-      result.warnings.push_back(
-          "the board is too square to the axis to fix the scale of the surface: "
-          "tilt it by 20 degrees or more");
-    }
-    result.warnings.push_back(
-        "the surface is known up to one scale only (rays (x, y, c h), c unknown): "
-        "this lens is not metric");
-  }
-
-  double squares = 0.0;
-  for (const ScanObservation& o : data.observations) {
-    if (o.weight < 1.0) continue;
-    const double r = residualOf(o, estimate);
-    squares += r * r;
-    ++result.observations;
-  }
-  result.points = static_cast<int>(estimate.points.size());
-  result.rms_px = std::sqrt(squares / std::max(1, result.observations));
-  const double field = largestAngle(data.observations, estimate);
-  if (auto lens = estimate.lens->withParameters(estimate.lens->parameters(), field)) {
-    estimate.lens = lens;
-  }
-  for (const Pose& pose : estimate.T_scan) result.T_first_scan.push_back(pose.inverse());
-  result.file.image_size = tracks.image_size;
-  result.file.lens = estimate.lens;
-  result.file.stage_axis = estimate.axis;
-  result.file.calibration.rms_px = result.rms_px;
-  result.file.calibration.points = result.points;
-  if (known) {
-    const double sigma = noise();
-    result.file.covariance = sigma * sigma * lensCovariance(data, estimate, !joints.empty());
-  }
-  return result;
+TargetFreeResult calibrateTargetFree(const std::vector<StageScan>& scans,
+                                     const TrackingOptions& tracking,
+                                     const TargetFreeOptions& options) {
+  const FeatureTracks tracks = trackFeatures(scans, tracking, options.progress);
+  TargetFreeResult result = calibrateTargetFree(tracks, options);
+  TargetFreeOptions last = options;
+  last.grow = false;
+  result = refine(scans, tracks, result, options);
+  return refine(scans, tracks, result, last);
 }
 
 }  // namespace omnister

@@ -19,7 +19,7 @@ namespace {
 
 struct Arguments {
   std::vector<std::string> scans;
-  std::string model = "asphere";
+  std::string model = "auto";
   int even_terms = 2;
   std::string known_angle;
   std::string board_detections;
@@ -74,8 +74,9 @@ const char* nameOf(SurfaceScale scale) {
 void run(const Arguments& arguments, bool json) {
   checkOutputs({arguments.board_detections}, {arguments.out});
   TargetFreeOptions options;
-  options.structure.model = arguments.model;
-  options.structure.even_terms = arguments.model == "asphere" ? arguments.even_terms : 0;
+  options.grow = arguments.model == "auto";
+  options.structure.model = options.grow ? "asphere" : arguments.model;
+  options.structure.even_terms = arguments.model == "conic" ? 0 : arguments.even_terms;
   options.threads = arguments.threads;
   options.progress = consoleProgress();
   if (!arguments.known_angle.empty()) options.known_angle = parseKnownAngle(arguments.known_angle);
@@ -87,8 +88,7 @@ void run(const Arguments& arguments, bool json) {
   TrackingOptions tracking;
   tracking.features_per_scan = arguments.features;
   tracking.threads = arguments.threads;
-  const FeatureTracks tracks = trackFeatures(scans, tracking, options.progress);
-  TargetFreeResult result = calibrateTargetFree(tracks, options);
+  TargetFreeResult result = calibrateTargetFree(scans, tracking, options);
   for (const std::string& warning : result.warnings) say("omnister: " + warning);
   if (result.scale == SurfaceScale::kFree && !arguments.accept_free_scale) {
     throw Error(
@@ -132,10 +132,14 @@ void addCalibrateScan(CLI::App& app) {
           "Folders with a replay.yaml that gives every image its stage_position_m; the rig may "
           "be turned between folders, not within one")
       ->required();
-  command->add_option("--model", arguments->model, "Radial lens model")
-      ->check(CLI::IsMember({"conic", "asphere"}))
+  command
+      ->add_option("--model", arguments->model,
+                   "Radial lens model; auto: an asphere, or more where the images ask for it")
+      ->check(CLI::IsMember({"auto", "conic", "asphere"}))
       ->capture_default_str();
-  command->add_option("--even-terms", arguments->even_terms, "Asphere: even terms beyond the conic")
+  command
+      ->add_option("--even-terms", arguments->even_terms,
+                   "Asphere: even terms beyond the conic to start from")
       ->check(CLI::Range(0, 3))
       ->capture_default_str();
   command->add_option("--known-angle", arguments->known_angle,
