@@ -24,11 +24,6 @@
 namespace omnister {
 namespace {
 
-/// Geometries whose matcher is kept: a stage that goes to and fro has two.
-constexpr std::size_t kMatchersKept = 4;
-/// Poses nearer than this share of the baseline have the same matcher: far below a pixel.
-constexpr double kSamePlace = 2e-4;
-constexpr double kSameAngle = 1e-4;  // [rad]
 /// Lenses that may wait to be read: in a shorter queue an older one that comes later pushes out the
 /// one that counts.
 constexpr std::uint32_t kLensesWaiting = 16;
@@ -39,22 +34,6 @@ constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said
 cv::Mat loadMask(const std::string& path) {
   if (path.empty()) return {};
   return readImage(path, ImageColor::kGray);
-}
-
-bool sameGeometry(const StereoGeometry& a, const StereoGeometry& b) {
-  if (a.reference_lens != b.reference_lens || a.displaced.size() != b.displaced.size())
-    return false;
-  for (std::size_t i = 0; i < a.displaced.size(); ++i) {
-    const Pose& first = a.displaced[i].T_ref_disp;
-    const Pose& second = b.displaced[i].T_ref_disp;
-    if (a.displaced[i].lens != b.displaced[i].lens) return false;
-    if ((first.translation() - second.translation()).norm() >
-        kSamePlace * second.translation().norm())
-      return false;
-    if (Eigen::AngleAxisd(first.linear().transpose() * second.linear()).angle() > kSameAngle)
-      return false;
-  }
-  return true;
 }
 
 /// Frames that may be needed to find `positions` places.
@@ -180,6 +159,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       live_(parameters_),
       pairing_(parameters_.pairing),
       last_cloud_(ros::SteadyTime::now()),
+      worker_(parameters_.matcher, parameters_.matching),
       diagnostics_(node, private_node) {
   const std::vector<std::string> prefixes =
       parameters_.rig ? std::vector<std::string>{"left/", "right/"} : std::vector<std::string>{""};
@@ -232,7 +212,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
   diagnostics_timer_ = node_.createSteadyTimer(
       ros::WallDuration(1.0),
       [this](const ros::SteadyTimerEvent&) { diagnostics_.force_update(); });
-  worker_ = std::thread([this] { run(); });
+  thread_ = std::thread([this] { run(); });
 }
 
 StereoPipeline::~StereoPipeline() {
@@ -243,7 +223,7 @@ StereoPipeline::~StereoPipeline() {
     stopping_ = true;
   }
   wake_.notify_all();
-  worker_.join();
+  thread_.join();
   points_publisher_.shutdown();
   depth_publisher_.shutdown();
   range_publisher_.shutdown();
@@ -281,8 +261,7 @@ void StereoPipeline::configure(StereoConfig& config) {
     return std::find(choices.begin(), choices.end(), value) != choices.end();
   };
   if (!known(config.matcher, {"sweep", "thesis"})) config.matcher = before.matcher;
-  if (!known(config.preset, {"custom", "balanced", "accurate"}))
-    config.preset = before.preset;
+  if (!known(config.preset, {"custom", "balanced", "accurate"})) config.preset = before.preset;
   StereoConfig preset = config;
   applyPreset(preset);
   if (config.preset != before.preset)
@@ -469,7 +448,7 @@ void StereoPipeline::onImage(const sensor_msgs::ImageConstPtr& image) {
 
 void StereoPipeline::onImages(const sensor_msgs::ImageConstPtr& left,
                               const sensor_msgs::ImageConstPtr& right) {
-  Job job;
+  StereoSet job;
   try {
     checkFrame(*left, expectedSize(0), eyes_[0].topic);
     checkFrame(*right, expectedSize(1), eyes_[1].topic);
@@ -532,7 +511,7 @@ PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t 
   return answer;
 }
 
-std::optional<StereoPipeline::Job> StereoPipeline::nextJob() {
+std::optional<StereoSet> StereoPipeline::nextJob() {
   std::unique_lock<std::mutex> lock(mutex_);
   const auto due_in = [&] {
     return live_.min_period - (ros::SteadyTime::now() - last_start_).toSec();
@@ -555,28 +534,17 @@ void StereoPipeline::pollPairing() {
                     nowNanoseconds());
   if (!pairing_.reason().empty()) reason_ = pairing_.reason();
   if (!set) return;
-  const auto message = [](const PairingFrame& frame) {
-    const std::shared_ptr<const void> held = frame.image;
-    return sensor_msgs::ImageConstPtr(static_cast<const sensor_msgs::Image*>(held.get()),
-                                      [held](const sensor_msgs::Image*) {});
-  };
-  Job job;
-  job.reference = message(set->reference);
-  for (const FrameSet::Displaced& displaced : set->displaced) {
-    job.displaced.push_back(message(displaced.frame));
-    job.T_ref_disp.push_back(displaced.T_ref_disp);
-  }
-  putPending(std::move(job));
+  putPending(toStereoSet(*set));
 }
 
-void StereoPipeline::putPending(Job job) {
+void StereoPipeline::putPending(StereoSet job) {
   if (pending_) ++drops_["busy"];
   pending_ = std::move(job);
 }
 
 void StereoPipeline::run() {
   for (;;) {
-    std::optional<Job> job;
+    std::optional<StereoSet> job;
     try {
       job = nextJob();
       if (job) process(*job);
@@ -601,49 +569,24 @@ void StereoPipeline::run() {
   }
 }
 
-Matcher& StereoPipeline::matcherFor(const StereoGeometry& geometry, const StereoParameters& live,
-                                    std::size_t generation) {
-  matchers_.remove_if([&](const CachedMatcher& kept) { return kept.generation != generation; });
-  const auto known = std::find_if(
-      matchers_.begin(), matchers_.end(),
-      [&](const CachedMatcher& kept) { return sameGeometry(kept.geometry, geometry); });
-  if (known != matchers_.end()) {
-    matchers_.splice(matchers_.begin(), matchers_, known);
-  } else {
-    matchers_.push_front(
-        {generation, geometry, makeMatcher(live.matcher, geometry, live.matching)});
-    if (matchers_.size() > kMatchersKept) matchers_.pop_back();
-  }
-  return *matchers_.front().matcher;
-}
-
-void StereoPipeline::publishOverlay(const Job& job, const StereoGeometry& geometry,
-                                    const StereoParameters& live, const MatchResult& result,
-                                    int bits) {
+void StereoPipeline::publishOverlay(const StereoSet& job, const PreparedSet& prepared,
+                                    const StereoParameters& live, const MatchResult& result) {
   std::vector<cv::Point2d> pixels;
   {
     std::lock_guard<std::mutex> lock(mutex_);
     pixels = clicked_;
   }
   if (pixels.empty()) pixels = parsePixels(live.epipolar_pixels, "epipolar_pixels");
-  if (pixels.empty()) pixels = defaultPixels(geometry.reference_size);
-  const cv::Mat picture =
-      drawEpipolarOverlay(toBgr(*job.reference, bits), toBgr(*job.displaced.front(), bits),
-                          geometry, live.matching, result, pixels);
+  if (pixels.empty()) pixels = defaultPixels(prepared.geometry.reference_size);
+  const cv::Mat picture = drawEpipolarOverlay(toBgr(*job.reference, prepared.bits),
+                                              toBgr(*job.displaced.front(), prepared.bits),
+                                              prepared.geometry, live.matching, result, pixels);
   const sensor_msgs::ImagePtr message = toImage(picture, sensor_msgs::image_encodings::BGR8);
   message->header = job.reference->header;
   epipolar_publisher_.publish(message);
 }
 
-const cv::Mat& StereoPipeline::raysOf(const LensFile& file) {
-  if (rays_lens_ != file.lens) {
-    rays_ = viewingRays(*file.lens, file.image_size, parameters_.matching.threads);
-    rays_lens_ = file.lens;
-  }
-  return rays_;
-}
-
-void StereoPipeline::process(const Job& job) {
+void StereoPipeline::process(const StereoSet& job) {
   const ros::SteadyTime start = ros::SteadyTime::now();
   Laps laps;
   std::vector<LensFile> lenses;
@@ -663,38 +606,23 @@ void StereoPipeline::process(const Job& job) {
   // A lens may have come after the images.
   const LensFile& reference_lens = lenses.front();
   const LensFile& displaced_lens = lenses.back();
-  checkFrame(*job.reference, reference_lens.image_size, eyes_.front().topic);
-  for (const auto& image : job.displaced)
-    checkFrame(*image, displaced_lens.image_size, eyes_.back().topic);
+  const PreparedSet prepared = StereoWorker::prepare(job, reference_lens, displaced_lens,
+                                                     eyes_.front().topic, eyes_.back().topic);
   publishLens(job.reference->header.frame_id);
-  const cv::Mat& mask = live.matching.mask;
-  if (!mask.empty() && mask.size() != reference_lens.image_size)
-    throw InputError("~mask", "size", "is not that of the lens' image");
-
-  StereoGeometry geometry;
-  geometry.reference_lens = reference_lens.lens;
-  geometry.reference_size = reference_lens.image_size;
-  for (const Pose& pose : job.T_ref_disp)
-    geometry.displaced.push_back({displaced_lens.lens, displaced_lens.image_size, pose});
-
-  int bits = significantBits(*job.reference);
-  for (const auto& image : job.displaced) bits = std::max(bits, significantBits(*image));
-  const cv::Mat reference = toGray(*job.reference, bits);
-  std::vector<cv::Mat> displaced;
-  for (const auto& image : job.displaced) displaced.push_back(toGray(*image, bits));
-
   laps.lap("convert");
-  Matcher& matcher = matcherFor(geometry, live, generation);
+  if (generation != worker_generation_) {
+    worker_.configure(live.matcher, live.matching);
+    worker_generation_ = generation;
+  }
+  Matcher& matcher = worker_.matcherFor(prepared.geometry);
   laps.lap("prepare");
-  const MatchResult result = matcher.match(reference, displaced);
+  const MatchResult result = matcher.match(prepared.reference, prepared.displaced);
   laps.lap("match");
 
   const std_msgs::Header& header = job.reference->header;
   const bool points_wanted = points_publisher_.getNumSubscribers() > 0;
   if (points_wanted || depth_publisher_.getNumSubscribers() > 0) {
-    const Cloud cloud =
-        makeCloud(result, raysOf(reference_lens),
-                  points_wanted ? toBgr(*job.reference, bits) : reference, live.matching.threads);
+    const Cloud cloud = worker_.points(job, prepared, result, reference_lens, points_wanted);
     if (points_wanted) points_publisher_.publish(toPointCloud(cloud, header));
     if (depth_publisher_.getNumSubscribers() > 0) depth_publisher_.publish(toDepth(cloud, header));
   }
@@ -703,7 +631,7 @@ void StereoPipeline::process(const Job& job) {
 
   laps.lap("publish");
   if (epipolar_publisher_.getNumSubscribers() > 0) {
-    publishOverlay(job, geometry, live, result, bits);
+    publishOverlay(job, prepared, live, result);
     laps.lap("overlay");
   }
 

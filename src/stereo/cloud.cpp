@@ -417,8 +417,10 @@ void writeCloud(const fs::path& path, const Cloud& cloud) { stageCloud(path, clo
 void writeRange(const fs::path& path, const cv::Mat& range) { stageRange(path, range)->commit(); }
 
 Cloud readCloud(const fs::path& path) {
-  const std::string bytes = readFile(path, std::size_t{4} << 30);
-  const std::string source = path.string();
+  return parseCloud(readFile(path, std::size_t{4} << 30), path.string());
+}
+
+Cloud parseCloud(std::string_view bytes, const std::string& source) {
   HeaderReader header(bytes, source);
   header.expect("ply");
   header.expect("format binary_little_endian 1.0");

@@ -31,13 +31,18 @@ void addEvaluate(CLI::App& app);
 void addRender(CLI::App& app);
 void addDewarp(CLI::App& app);
 void addTarget(CLI::App& app);
+#ifdef OMNISTER_WITH_ROS
+void addBag(CLI::App& app);
+#endif
 
 namespace {
 
 constexpr AddCommand kCommands[] = {
     addCalibrate, addCalibrateScan, addCalibrateStereo, addImport, addExport, addProject,
     addUnproject, addStereo,        addEvaluate,        addRender, addDewarp, addTarget,
-    nullptr,
+#ifdef OMNISTER_WITH_ROS
+    addBag,
+#endif
 };
 
 std::string describe(const nlohmann::ordered_json& value) {
@@ -150,7 +155,7 @@ int runCommandLine(int argc, const char* const* argv) {
   app.set_version_flag("--version", OMNISTER_VERSION);
   app.require_subcommand(1);
   for (const AddCommand add : kCommands) {
-    if (add != nullptr) add(app);
+    add(app);
   }
   try {
     app.parse(argc, argv);

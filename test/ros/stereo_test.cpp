@@ -24,6 +24,7 @@
 #include "omnister/ros/stereo_messages.h"
 #include "omnister/ros/stereo_pipeline.h"
 #include "omnister/sim/renderer.h"
+#include "ros/rendered_views.h"
 #include "ros/ros_test.h"
 
 namespace omnister {
@@ -31,19 +32,10 @@ namespace {
 
 using test::Collector;
 using test::eventually;
-
-const std::string kSource = OMNISTER_SOURCE_DIR;
-constexpr double kBaseline = 0.2;
-
-/// A fisheye of about 180 degrees; small, so that tests are quick.
-LensFile lensFile() {
-  LensFile file;
-  file.image_size = {400, 300};
-  LensStructure structure;
-  structure.model = "conic";
-  file.lens = makeLens(structure, {201.3, 148.2}, 400.0 / 3.1, 1.6);
-  return file;
-}
+using test::kBaseline;
+using test::lensFile;
+using test::medianError;
+using test::views;
 
 /// Its file, there as long as the tests run.
 const std::string& lensPath() {
@@ -59,31 +51,6 @@ const std::string& lensPath() {
   };
   static const Folder folder;
   return folder.file;
-}
-
-/// Two rendered views of the room, a step to the right apart, and the truth of the second.
-struct Views {
-  LensFile lens = lensFile();
-  cv::Mat left;
-  cv::Mat right;  // CV_8UC3
-  cv::Mat right_range;
-
-  Views() {
-    const sim::ScenePtr scene = sim::readScene(kSource + "/config/scenes/room.yaml");
-    const sim::Renderer renderer(*lens.lens, lens.image_size);
-    sim::RenderOptions options;
-    options.adaptive = true;
-    left = renderer.render(*scene, Pose::Identity(), options).image;
-    const sim::Rendering rendering =
-        renderer.render(*scene, Pose(Eigen::Translation3d(kBaseline, 0, 0)), options);
-    right = rendering.image;
-    right_range = rendering.range;
-  }
-};
-
-const Views& views() {
-  static const Views instance;
-  return instance;
 }
 
 /// A camera on a stage as its messages show it.
@@ -137,22 +104,6 @@ void publishPair(Camera& camera, const ros::Time& first, const ros::Time& second
   camera.publish(toImage(views().left, "bgr8"), first);
   camera.rest(kBaseline, second);
   camera.publish(toImage(views().right, "bgr8"), second);
-}
-
-double medianError(const cv::Mat& range, const cv::Mat& truth, double* share) {
-  std::vector<double> errors;
-  int known = 0;
-  for (int v = 0; v < truth.rows; ++v)
-    for (int u = 0; u < truth.cols; ++u) {
-      if (std::isnan(truth.at<float>(v, u))) continue;
-      ++known;
-      if (std::isnan(range.at<float>(v, u))) continue;
-      errors.push_back(std::abs(range.at<float>(v, u) / truth.at<float>(v, u) - 1.0));
-    }
-  *share = known > 0 ? static_cast<double>(errors.size()) / known : 0.0;
-  if (errors.empty()) return std::numeric_limits<double>::infinity();
-  std::nth_element(errors.begin(), errors.begin() + errors.size() / 2, errors.end());
-  return errors[errors.size() / 2];
 }
 
 cv::Mat floats(const sensor_msgs::Image& image) {

@@ -16,7 +16,6 @@
 #include <tf2_ros/transform_listener.h>
 
 #include <condition_variable>
-#include <list>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -29,6 +28,7 @@
 #include "omnister/ros/frame_pairing.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
+#include "omnister/ros/stereo_worker.h"
 #include "omnister/stereo/matcher.h"
 
 namespace omnister {
@@ -73,16 +73,6 @@ class StereoPipeline {
     ros::Time lens_stamp;
     bool lens_from_file = false;
   };
-  struct Job {
-    sensor_msgs::ImageConstPtr reference;
-    std::vector<sensor_msgs::ImageConstPtr> displaced;
-    std::vector<Pose> T_ref_disp;
-  };
-  struct CachedMatcher {
-    std::size_t generation;  ///< of live_ it was made with
-    StereoGeometry geometry;
-    std::unique_ptr<Matcher> matcher;
-  };
   using SyncPolicy =
       message_filters::sync_policies::ApproximateTime<sensor_msgs::Image, sensor_msgs::Image>;
 
@@ -100,15 +90,12 @@ class StereoPipeline {
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
   void run();
-  std::optional<Job> nextJob();
-  void pollPairing();        ///< mutex_ is held
-  void putPending(Job job);  ///< mutex_ is held
-  void process(const Job& job);
-  Matcher& matcherFor(const StereoGeometry& geometry, const StereoParameters& live,
-                      std::size_t generation);
-  void publishOverlay(const Job& job, const StereoGeometry& geometry, const StereoParameters& live,
-                      const MatchResult& result, int bits);
-  const cv::Mat& raysOf(const LensFile& file);
+  std::optional<StereoSet> nextJob();
+  void pollPairing();              ///< mutex_ is held
+  void putPending(StereoSet job);  ///< mutex_ is held
+  void process(const StereoSet& job);
+  void publishOverlay(const StereoSet& job, const PreparedSet& prepared,
+                      const StereoParameters& live, const MatchResult& result);
   PoseAnswer cameraPose(const std::string& frame_id, std::int64_t stamp_ns) const;
   std::optional<Pose> rigPose(const sensor_msgs::Image& left, const sensor_msgs::Image& right,
                               std::string* reason) const;
@@ -149,7 +136,7 @@ class StereoPipeline {
   std::string reference_frame_;       ///< optical frame of the last reference image
   std::string lens_frame_;            ///< the frame that the lens marker was published in
   FramePairing pairing_;
-  std::optional<Job> pending_;  ///< newest set that waits to be matched
+  std::optional<StereoSet> pending_;  ///< newest set that waits to be matched
   std::map<std::string, std::size_t> drops_;
   std::map<std::string, ros::SteadyTime> warned_;
   std::string reason_ = "no image yet";
@@ -158,10 +145,9 @@ class StereoPipeline {
   ros::SteadyTime last_cloud_;  ///< or since when somebody listens
   MatchStatistics last_statistics_;
 
-  std::list<CachedMatcher> matchers_;  ///< most recently used first; worker only
-  LensPtr rays_lens_;                  ///< of rays_; worker only
-  cv::Mat rays_;                       ///< CV_32FC3, unit viewing rays; worker only
-  std::thread worker_;
+  StereoWorker worker_;                ///< used by thread_ only
+  std::size_t worker_generation_ = 0;  ///< of live_ that worker_ was set up with
+  std::thread thread_;
 
   diagnostic_updater::Updater diagnostics_;
   ros::SteadyTimer diagnostics_timer_;

@@ -5,6 +5,8 @@
 #include <filesystem>
 #include <memory>
 #include <opencv2/core/mat.hpp>
+#include <string>
+#include <string_view>
 #include <vector>
 
 #include "omnister/common/file_io.h"
@@ -66,6 +68,9 @@ void writeCloud(const std::filesystem::path& path, const Cloud& cloud);
 /// Reads what writeCloud() wrote as PLY; every byte is accounted for.
 /// @throws InputError naming the line or point, or IoError
 Cloud readCloud(const std::filesystem::path& path);
+
+/// The same for bytes in memory. @param source for messages
+Cloud parseCloud(std::string_view bytes, const std::string& source);
 
 /// 32-bit float TIFF, atomic. @throws IoError, or InputError for an extension other than .tif or
 /// .tiff
