@@ -116,6 +116,9 @@ void checkImage(const sensor_msgs::Image& image, std::size_t max_pixels) {
     refuse("step", "is " + std::to_string(image.step) + ", expected at least " +
                        std::to_string(image.width * bytes));
   }
+  if (enc::bitDepth(image.encoding) == 16 && image.step % 2 != 0) {
+    refuse("step", "is " + std::to_string(image.step) + ", expected whole samples of 2 bytes");
+  }
   const std::uint64_t needed = static_cast<std::uint64_t>(image.step) * image.height;
   if (image.data.size() < needed) {
     refuse("data", "has " + std::to_string(image.data.size()) + " bytes, expected " +
@@ -123,8 +126,29 @@ void checkImage(const sensor_msgs::Image& image, std::size_t max_pixels) {
   }
 }
 
+bool foreignByteOrder(const sensor_msgs::Image& image) {
+  const std::uint16_t one = 1;
+  const bool big_here = *reinterpret_cast<const std::uint8_t*>(&one) == 0;
+  return enc::bitDepth(image.encoding) > 8 && (image.is_bigendian != 0) != big_here;
+}
+
+sensor_msgs::ImagePtr inOwnByteOrder(const sensor_msgs::Image& image) {
+  const auto copy = boost::make_shared<sensor_msgs::Image>(image);
+  const std::size_t sample = static_cast<std::size_t>(enc::bitDepth(image.encoding)) / 8;
+  const std::size_t row = sample * static_cast<std::size_t>(enc::numChannels(image.encoding)) *
+                          static_cast<std::size_t>(image.width);
+  for (std::size_t v = 0; v < image.height; ++v) {
+    std::uint8_t* begin = copy->data.data() + v * image.step;
+    for (std::size_t i = 0; i + sample <= row; i += sample)
+      std::reverse(begin + i, begin + i + sample);
+  }
+  copy->is_bigendian = image.is_bigendian == 0 ? 1 : 0;
+  return copy;
+}
+
 cv::Mat toMat8(const sensor_msgs::ImageConstPtr& image, bool color) {
   checkImage(*image);
+  if (foreignByteOrder(*image)) return toMat8(inOwnByteOrder(*image), color);
   const std::string target = color ? enc::BGR8 : enc::MONO8;
   try {
     const bool floating =

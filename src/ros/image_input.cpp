@@ -27,6 +27,7 @@ std::string eightBit(const std::string& encoding) {
 }
 
 cv::Mat convert(const sensor_msgs::Image& image, int bits, const std::string& wanted) {
+  if (foreignByteOrder(image)) return convert(*inOwnByteOrder(image), bits, wanted);
   try {
     const cv_bridge::CvImageConstPtr native = cv_bridge::toCvShare(image, {});
     cv_bridge::CvImage eight(image.header, eightBit(image.encoding));
@@ -79,6 +80,7 @@ void checkFrame(const sensor_msgs::Image& image, cv::Size expected, const std::s
 
 int significantBits(const sensor_msgs::Image& image) {
   if (enc::bitDepth(image.encoding) != 16) return 8;
+  if (foreignByteOrder(image)) return significantBits(*inOwnByteOrder(image));
   cv::Mat native = cv_bridge::toCvShare(image, {})->image;
   if (native.depth() != CV_16U) return 8;
   double brightest = 0.0;

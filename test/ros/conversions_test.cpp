@@ -10,6 +10,7 @@
 #include <opencv2/core.hpp>
 
 #include "omnister/lens/lens_models.h"
+#include "omnister/ros/image_input.h"
 
 namespace omnister {
 namespace {
@@ -24,6 +25,23 @@ LensFile lensFile() {
   file.lens = makeLens(structure, Eigen::Vector2d(319.5, 239.5), 200.0, 1.4);
   file.calibration.rms_px = 0.25;
   return file;
+}
+
+TEST(ImageMessages, BigEndianSamplesAreReadAsTheyWereMeant) {
+  const auto image = boost::make_shared<sensor_msgs::Image>();
+  image->header.stamp = ros::Time(1.0);
+  image->header.frame_id = "camera_optical";
+  image->encoding = "mono16";
+  image->width = 2;
+  image->height = 2;
+  image->step = 6;  // a sample of padding
+  image->is_bigendian = 1;
+  image->data = {0x12, 0, 0x34, 0, 9, 9, 0x56, 0, 0xff, 0, 9, 9};
+  const int bits = significantBits(*image);
+  EXPECT_EQ(bits, 16);
+  const cv::Mat expected = (cv::Mat_<uchar>(2, 2) << 0x12, 0x34, 0x56, 0xff);
+  EXPECT_EQ(cv::norm(toGray(*image, bits), expected, cv::NORM_INF), 0.0);
+  EXPECT_LE(cv::norm(toMat8(image, false), expected, cv::NORM_INF), 1.0);
 }
 
 TEST(Stamps, SurviveTheRoundTripAndStayInRange) {

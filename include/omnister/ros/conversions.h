@@ -40,6 +40,13 @@ sensor_msgs::ImagePtr toImage(const cv::Mat& image, const std::string& encoding)
 /// @throws InputError naming the field
 void checkImage(const sensor_msgs::Image& image, std::size_t max_pixels = 100u << 20);
 
+/// True for samples of more than one byte in the order of another machine, which cv_bridge
+/// misreads.
+bool foreignByteOrder(const sensor_msgs::Image& image);
+
+/// A copy in the byte order of this machine. @param image checked, foreignByteOrder()
+sensor_msgs::ImagePtr inOwnByteOrder(const sensor_msgs::Image& image);
+
 /// A checked image as 8-bit grey or BGR: Bayer is debayered, 16 bit is scaled to 8, alpha is
 /// dropped.
 /// @param color CV_8UC3 (BGR) instead of CV_8UC1
