@@ -653,6 +653,11 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
   }
   if (options.structure) checkStructure(*options.structure);
   if (options.folds < 0 || options.folds == 1) throw Error("folds must be 0 or at least 2");
+  if (options.folds > static_cast<int>(detections.views.size())) {
+    throw Error(std::to_string(options.folds) + " folds of " +
+                std::to_string(detections.views.size()) +
+                " views, expected at most as many folds as views");
+  }
   const auto report = [&](double fraction, const char* stage) {
     if (options.progress) options.progress(fraction, stage);
   };

@@ -31,17 +31,39 @@ void run(const Arguments& arguments) {
   inputs.push_back(arguments.common.target_file);
   inputs.push_back(arguments.positions_file);
   checkOutputs(inputs, {arguments.out});
+  checkReportFolder(arguments.common.report_folder);
   std::vector<StageView> positions;
   if (!arguments.positions_file.empty()) positions = readStagePositions(arguments.positions_file);
+  const auto place = [&](Detections& detections) {
+    if (positions.empty()) return std::vector<std::string>();
+    return applyStagePositions(positions, arguments.positions_file, detections);
+  };
   Detections detections =
       gatherDetections(arguments.common, arguments.images, arguments.detections_file, false);
-  if (!positions.empty()) {
-    for (const std::string& remark :
-         applyStagePositions(positions, arguments.positions_file, detections)) {
-      say("warning: " + printable(remark, 1000));
+  std::vector<std::string> remarks = place(detections);
+  const CalibrationOptions options = calibrationOptions(arguments.common);
+  CalibrationResult result = calibrate(detections, options);
+  nlohmann::ordered_json second_pass;
+  if (!arguments.images.empty() && !arguments.common.one_pass) {
+    GuidedPass pass = guidedPass(arguments.common, arguments.images, *result.file.lens, detections);
+    for (ViewDetections& view : pass.detections.views) view.stage.reset();
+    std::vector<std::string> pass_remarks = place(pass.detections);
+    bool kept = false;
+    try {
+      CalibrationResult again = calibrate(pass.detections, options);
+      kept = servesBetter(result, again);
+      if (kept) {
+        result = std::move(again);
+        detections = std::move(pass.detections);
+        remarks = std::move(pass_remarks);
+      }
+    } catch (const Error&) {
+      // The first fit stands.
     }
+    second_pass = secondPassFigures(pass, kept);
+    result.file.calibration.notes["second_pass"] = second_pass.dump();
   }
-  const CalibrationResult result = calibrate(detections, calibrationOptions(arguments.common));
+  for (const std::string& remark : remarks) say("warning: " + printable(remark, 1000));
   for (const std::string& warning : result.warnings) say("warning: " + printable(warning, 1000));
 
   nlohmann::ordered_json json;
@@ -53,6 +75,7 @@ void run(const Arguments& arguments) {
   addFigures(json, {&result});
   // Images without a board are views too.
   if (!arguments.images.empty()) json["views"] = arguments.images.size();
+  if (!second_pass.is_null()) json["second_pass"] = second_pass;
   json["max_theta_rad"] = result.file.lens->maxTheta();
   json["height_px"] = result.height_px;
   json["height_sigma_px"] = nullptr;

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "calibration_arguments.h"
 
+#include <unistd.h>
+
 #include <algorithm>
 #include <filesystem>
 
@@ -37,6 +39,8 @@ void addCalibrationArguments(CLI::App& command, CalibrationArguments& arguments)
       ->check(CLI::Range(0, 1024));
   command.add_flag("--flat-board", arguments.flat_board,
                    "Take the board as perfectly flat instead of fitting its bend");
+  command.add_flag("--one-pass", arguments.one_pass,
+                   "With images: no second detection guided by the first lens");
 }
 
 CalibrationOptions calibrationOptions(const CalibrationArguments& arguments) {
@@ -97,6 +101,39 @@ Detections gatherDetections(const CalibrationArguments& arguments,
   if (next != detections.views.size())
     throw Error("the detected views are not those of the images");
   return all;
+}
+
+GuidedPass guidedPass(const CalibrationArguments& arguments, const std::vector<std::string>& images,
+                      const LensModel& lens, const Detections& first) {
+  DetectorOptions options;
+  options.threads = arguments.threads;
+  return detectGuided(images, readTarget(arguments.target_file), lens, first, options,
+                      consoleProgress());
+}
+
+nlohmann::ordered_json secondPassFigures(const GuidedPass& pass, bool kept) {
+  return {{"kept", kept},
+          {"views_added", pass.views_added},
+          {"corners_before", pass.corners_before},
+          {"corners_after", pass.corners_after}};
+}
+
+void checkReportFolder(const std::string& folder) {
+  if (folder.empty()) return;
+  namespace fs = std::filesystem;
+  // The nearest folder that is there already must take what is made in it.
+  fs::path path = fs::absolute(folder).lexically_normal();
+  std::error_code ignored;
+  while (!fs::exists(path, ignored) && path != path.root_path()) path = path.parent_path();
+  if (!fs::is_directory(path, ignored)) {
+    throw InputError(folder, "",
+                     "cannot be a report's folder: " + printable(path.string()) + " is no folder");
+  }
+  if (::access(path.c_str(), W_OK | X_OK) != 0) {
+    throw InputError(
+        folder, "",
+        "cannot be a report's folder: " + printable(path.string()) + " may not be written to");
+  }
 }
 
 void writeReport(const std::string& folder, const std::string& name, const std::string& html) {

@@ -8,6 +8,7 @@
 
 #include "commands.h"
 #include "omnister/calibration/calibrate.h"
+#include "omnister/calibration/guided_pass.h"
 
 namespace omnister::tools {
 
@@ -19,9 +20,11 @@ struct CalibrationArguments {
   std::string report_folder;
   int threads = 0;
   bool flat_board = false;
+  bool one_pass = false;
 };
 
-/// `--target`, `--size`, `--model`, `--folds`, `--report`, `--threads`, `--flat-board`.
+/// `--target`, `--size`, `--model`, `--folds`, `--report`, `--threads`, `--flat-board`,
+/// `--one-pass`.
 void addCalibrationArguments(CLI::App& command, CalibrationArguments& arguments);
 
 CalibrationOptions calibrationOptions(const CalibrationArguments& arguments);
@@ -31,6 +34,18 @@ CalibrationOptions calibrationOptions(const CalibrationArguments& arguments);
 Detections gatherDetections(const CalibrationArguments& arguments,
                             const std::vector<std::string>& images,
                             const std::string& detections_file, bool keep_missed);
+
+/// Detection once more in all images, guided by a fitted lens; images that it adds are named on
+/// standard error.
+GuidedPass guidedPass(const CalibrationArguments& arguments, const std::vector<std::string>& images,
+                      const LensModel& lens, const Detections& first);
+
+/// `kept`, `views_added`, `corners_before`, `corners_after`.
+nlohmann::ordered_json secondPassFigures(const GuidedPass& pass, bool kept);
+
+/// To be called before any work: a report must not fail after it. Empty means no report.
+/// @throws InputError
+void checkReportFolder(const std::string& folder);
 
 /// Writes one file of a report, making the folder where it is missing. @throws IoError
 void writeReport(const std::string& folder, const std::string& name, const std::string& html);

@@ -4,6 +4,7 @@
 #include <unistd.h>
 
 #include <chrono>
+#include <cmath>
 #include <csignal>
 #include <cstdio>
 #include <deque>
@@ -59,7 +60,20 @@ bool& addJsonFlag(CLI::App& command) {
   return flag;
 }
 
+namespace {
+
+/// Whether a terminal's last line shows progress that other text must not run into.
+bool progress_line_open = false;
+
+void closeProgressLine() {
+  if (progress_line_open) std::fputs("\r\033[K", stderr);
+  progress_line_open = false;
+}
+
+}  // namespace
+
 void printResult(bool json, const nlohmann::ordered_json& result) {
+  closeProgressLine();
   if (json) {
     std::cout << result.dump() << '\n';
   } else {
@@ -71,13 +85,16 @@ void printResult(bool json, const nlohmann::ordered_json& result) {
   if (!std::cout) throw Error("cannot write to standard output");
 }
 
-void say(const std::string& message) { std::cerr << message << '\n'; }
+void say(const std::string& message) {
+  closeProgressLine();
+  std::cerr << message << '\n';
+}
 
 Progress consoleProgress() {
   using Clock = std::chrono::steady_clock;
   struct State {
     Clock::time_point start = Clock::now();
-    Clock::time_point last{};
+    Clock::time_point last = start;
     std::string stage;
   };
   const bool terminal = ::isatty(STDERR_FILENO) == 1;
@@ -86,17 +103,17 @@ Progress consoleProgress() {
     if (stage != state->stage) {
       state->stage = stage;
       state->start = now;
-    } else if (fraction < 1.0 &&
-               now - state->last < std::chrono::milliseconds(terminal ? 200 : 2000)) {
-      return;
     }
+    // What is over at once needs no line, least of all before an error.
+    if (now - state->last < std::chrono::milliseconds(terminal ? 200 : 2000)) return;
     state->last = now;
     const double elapsed = std::chrono::duration<double>(now - state->start).count();
     const double left = fraction > 0.0 ? elapsed * (1.0 - fraction) / fraction : 0.0;
-    std::fprintf(stderr,
-                 terminal ? "\r\033[K%s: %.0f %%, %.0f s left%s" : "%s: %.0f %%, %.0f s left%s",
-                 stage.c_str(), 100.0 * fraction, left, !terminal || fraction >= 1.0 ? "\n" : "");
+    std::string line = stage + ": " + std::to_string(std::lround(100.0 * fraction)) + " %";
+    if (fraction > 0.0) line += ", " + std::to_string(std::lround(left)) + " s left";
+    std::fprintf(stderr, terminal ? "\r\033[K%s" : "%s\n", line.c_str());
     std::fflush(stderr);
+    progress_line_open = terminal;
   };
 }
 
@@ -130,6 +147,9 @@ void checkOutputs(const std::vector<std::string>& inputs, const std::vector<std:
     if (std::filesystem::is_directory(output, ignored)) {
       throw InputError(output, "", "cannot be written: it is a folder");
     }
+    if (::access(folder.empty() ? "." : folder.c_str(), W_OK | X_OK) != 0) {
+      throw InputError(output, "", "cannot be written: its folder may not be written to");
+    }
     others.push_back(output);
   }
 }
@@ -159,15 +179,16 @@ int runCommandLine(int argc, const char* const* argv) {
   }
   try {
     app.parse(argc, argv);
+    closeProgressLine();
     return 0;
   } catch (const CLI::ParseError& error) {
     return app.exit(error) == 0 ? 0 : 2;
   } catch (const Error& error) {
-    std::cerr << "omnister: " << error.what() << '\n';
+    say(std::string("omnister: ") + error.what());
   } catch (const std::bad_alloc&) {
-    std::cerr << "omnister: not enough memory\n";
+    say("omnister: not enough memory");
   } catch (const std::exception& error) {
-    std::cerr << "omnister: " << printable(error.what(), 1000) << '\n';
+    say("omnister: " + printable(error.what(), 1000));
   }
   return 1;
 }

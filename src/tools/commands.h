@@ -23,8 +23,8 @@ void printResult(bool json, const nlohmann::ordered_json& result);
 /// A remark for a person, on standard error.
 void say(const std::string& message);
 
-/// Progress on standard error, at most a few lines a second, with percentage and time left;
-/// rewrites its line on a terminal.
+/// Progress on standard error with percentage and time left: rewrites one line on a terminal, else a
+/// line every two seconds, and none for what is over sooner.
 Progress consoleProgress();
 
 /// To be called before any work: no output may be an input or another output (links followed), a
