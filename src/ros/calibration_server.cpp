@@ -74,7 +74,7 @@ CalibrationServer::CalibrationServer(const ros::NodeHandle& node,
     : parameters_(load(private_node)),
       node_(node),
       transport_(node_),
-      diagnostics_(node, private_node) {
+      diagnostics_(node, private_node, private_node.getNamespace()) {
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
   // Latched: the last picture stays to be seen.
   coverage_publisher_ = node_.advertise<sensor_msgs::Image>("coverage", 1, true);

@@ -60,6 +60,7 @@ void FramePairing::reset(const std::string& reason) {
   history_.clear();
   newest_.reset();
   last_stamp_ns_.reset();
+  missed_baseline_.reset();
   ++counts_["resets"];
   reason_ = reason;
 }
@@ -178,9 +179,11 @@ std::optional<FrameSet> FramePairing::makeSet() {
     if (static_cast<int>(set.displaced.size()) == options_.positions) {
       ++counts_["paired"];
       reason_.clear();
+      missed_baseline_.reset();
       return set;
     }
   }
+  if (!std::isnan(nearest_miss)) missed_baseline_ = nearest_miss;
   std::string why;
   if (!set.displaced.empty())
     why = std::to_string(set.displaced.size()) + " of " + std::to_string(options_.positions) +

@@ -160,7 +160,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       pairing_(parameters_.pairing),
       last_cloud_(ros::SteadyTime::now()),
       worker_(parameters_.matcher, parameters_.matching),
-      diagnostics_(node, private_node) {
+      diagnostics_(node, private_node, private_node.getNamespace()) {
   const std::vector<std::string> prefixes =
       parameters_.rig ? std::vector<std::string>{"left/", "right/"} : std::vector<std::string>{""};
   std::string files[] = {parameters_.lens, parameters_.lens_displaced};
@@ -684,6 +684,7 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
     for (const auto& [test, pixels] : last_statistics_.rejected)
       status.add("pixels rejected, " + test, pixels);
   }
+  if (pairing_.missedBaseline()) status.add("baseline missed [m]", *pairing_.missedBaseline());
   for (const auto& [name, count] : pairing_.counts()) status.add("frames, " + name, count);
   for (const auto& [name, count] : drops_) status.add("dropped, " + name, count);
 }

@@ -35,6 +35,7 @@ void addTarget(CLI::App& app);
 #ifdef OMNISTER_WITH_ROS
 void addBag(CLI::App& app);
 #endif
+void addDoctor(CLI::App& app);
 
 namespace {
 
@@ -44,6 +45,7 @@ constexpr AddCommand kCommands[] = {
 #ifdef OMNISTER_WITH_ROS
     addBag,
 #endif
+    addDoctor,
 };
 
 std::string describe(const nlohmann::ordered_json& value) {

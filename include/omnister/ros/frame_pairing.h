@@ -86,6 +86,9 @@ class FramePairing {
   std::size_t held() const { return waiting_.size() + history_.size() + (newest_ ? 1 : 0); }
   /// Why the last settled or refused frame made no set; empty after one that did.
   const std::string& reason() const { return reason_; }
+  /// Since the last set: the distance between two places that came last and was not within the
+  /// baseline limits [m].
+  const std::optional<double>& missedBaseline() const { return missed_baseline_; }
   /// Frames by what became of them: "received", "settled", "paired", and by what dropped them.
   const std::map<std::string, std::size_t>& counts() const { return counts_; }
 
@@ -108,6 +111,7 @@ class FramePairing {
   std::optional<PairingFrame> newest_;
   std::optional<std::int64_t> last_stamp_ns_;
   std::string reason_ = "no image yet";
+  std::optional<double> missed_baseline_;
   std::map<std::string, std::size_t> counts_;
 };
 
