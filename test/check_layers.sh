@@ -4,7 +4,7 @@ set -euo pipefail
 cd "${1:-$(dirname "$0")/..}"
 
 ros='ros/|rosbag/|nodelet/|pluginlib/|tf2|image_transport/|cv_bridge/|actionlib|dynamic_reconfigure/|diagnostic_|message_filters/|[a-z_]+_msgs/|std_srvs/|omnister/ros/|omnister/[A-Z][A-Za-z]*\.h'
-devices='arv|libserialport|linux/videodev2|libv4l|termios|omnister/device/'
+devices='arv|boost/asio|libserialport|linux/videodev2|libv4l|termios|omnister/device/'
 
 status=0
 check() {

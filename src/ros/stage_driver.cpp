@@ -22,6 +22,17 @@ constexpr double kProgress = 1e-7;
 
 StageParameters loadStageParameters(const ros::NodeHandle& private_node, StageParameters p) {
   Parameters source(private_node);
+  p.device = source.text("device", p.device);
+  p.settings.unit_m = source.number("unit_m", p.settings.unit_m, -1.0, 1.0, "m");
+  p.settings.baud = source.integer("baud", p.settings.baud, 0, 4000000);
+  p.settings.device_number = source.integer("device_number", p.settings.device_number, 1, 99);
+  p.settings.axis_number = source.integer("axis_number", p.settings.axis_number, 1, 9);
+  p.external.topic = source.text("external_topic", p.external.topic);
+  p.external.joint = source.text("external_joint", p.external.joint);
+  p.external.frame_id = source.frame("external_frame_id", p.external.frame_id);
+  p.external.child_frame_id = source.frame("external_child_frame_id", p.external.child_frame_id);
+  p.external.command_topic = source.text("external_command", p.external.command_topic);
+  p.external.timeout_s = source.number("external_timeout", p.external.timeout_s, 0.02, 60.0, "s");
   p.axis = source.direction("axis", p.axis);
   p.min_m = source.number("min_m", p.min_m, -100.0, 100.0, "m");
   p.max_m = source.number("max_m", p.max_m, -100.0, 100.0, "m");
@@ -34,6 +45,12 @@ StageParameters loadStageParameters(const ros::NodeHandle& private_node, StagePa
   p.rate_hz = source.number("rate", p.rate_hz, 20.0, 500.0, "Hz");
   p.tolerance_m = source.number("tolerance_m", p.tolerance_m, 1e-9, 0.1, "m");
   p.stall_timeout_s = source.number("stall_timeout", p.stall_timeout_s, 0.2, 600.0, "s");
+  p.move_timeout_s = source.number("move_timeout", p.move_timeout_s, 0.1, 36000.0, "s");
+  p.home_timeout_s = source.number("home_timeout", p.home_timeout_s, 0.1, 36000.0, "s");
+  // What tf says already is not said again.
+  const bool from_tf = p.device == "external" && !p.external.frame_id.empty();
+  p.publish_tf = source.flag("publish_tf", p.publish_tf && !from_tf);
+  p.required = source.flag("required", p.required);
   p.retry_period_s = source.number("retry_period", p.retry_period_s, 0.05, 60.0, "s");
   p.frame_id = source.frame("frame_id", p.frame_id);
   p.child_frame_id = source.frame("child_frame_id", p.child_frame_id);
@@ -43,17 +60,40 @@ StageParameters loadStageParameters(const ros::NodeHandle& private_node, StagePa
   return p;
 }
 
+OpenStage stageOpener(const ros::NodeHandle& node, const StageParameters& p) {
+  if (p.device == "external") {
+    const double unit = p.settings.unit_m != 0.0 ? p.settings.unit_m : 1.0;
+    return [source = std::make_shared<ExternalStageSource>(node, p.external, p.axis, unit)] {
+      return source->openStage();
+    };
+  }
+  const std::string backend = p.device.substr(0, p.device.find(':'));
+  if ((backend != "zaber" && backend != "grbl") || p.device.size() < backend.size() + 2) {
+    throw InputError(
+        "stage", "device",
+        "is \"" + printable(p.device) + "\", expected zaber:PORT, grbl:PORT or external");
+  }
+  if (backend == "zaber" && p.settings.unit_m == 0.0) {
+    throw InputError("stage", "unit_m",
+                     "is not set, expected the length of a Zaber microstep in metres");
+  }
+  return [device = p.device, settings = p.settings] { return device::openStage(device, settings); };
+}
+
 StageDriver::StageDriver(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
                          StageParameters parameters, OpenStage open)
     : node_(node),
       parameters_(std::move(parameters)),
       open_(std::move(open)),
-      joint_publisher_(node_.advertise<sensor_msgs::JointState>("joint_states", 50)),
       state_publisher_(node_.advertise<StageState>("stage_state", 50)),
       diagnostics_(node, private_node, private_node.getNamespace()),
       server_(
           node_, "move_stage", [this](Server::GoalHandle handle) { onGoal(std::move(handle)); },
           [this](Server::GoalHandle handle) { onCancel(std::move(handle)); }, false) {
+  const bool echo =
+      parameters_.device == "external" && parameters_.external.frame_id.empty() &&
+      node_.resolveName(parameters_.external.topic) == node_.resolveName("joint_states");
+  if (!echo) joint_publisher_ = node_.advertise<sensor_msgs::JointState>("joint_states", 50);
   home_ = node_.advertiseService("home", &StageDriver::onHome, this);
   halt_ = node_.advertiseService("halt", &StageDriver::onHalt, this);
   recover_ = node_.advertiseService("recover", &StageDriver::onRecover, this);
@@ -80,10 +120,15 @@ void StageDriver::run() {
       std::chrono::duration<double>(1.0 / parameters_.rate_hz));
   Steady::time_point next = Steady::now();
   while (!stop_) {
+    openIfNeeded();
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       try {
-        pollLocked();
+        if (stage_) {
+          pollLocked();
+        } else {
+          publishLocked(reading_);
+        }
       } catch (const std::exception& e) {
         lostLocked(e.what());
       }
@@ -94,42 +139,74 @@ void StageDriver::run() {
   }
 }
 
-bool StageDriver::openLocked() {
-  if (stage_) return true;
-  if (Steady::now() < next_attempt_) return false;
+void StageDriver::openIfNeeded() {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (stage_ || Steady::now() < next_attempt_) return;
+  }
+  // Some devices take seconds to open, and nobody shall wait for that.
+  std::unique_ptr<device::Stage> stage;
+  std::string problem;
+  try {
+    stage = open_();
+    const device::StageReading reading = stage->read();
+    if (reading.moving) {
+      ROS_WARN("the stage moves though nobody watches it: stopping it");
+      stage->stop();
+    }
+  } catch (const std::exception& e) {
+    stage.reset();
+    problem = e.what();
+  }
+  const std::lock_guard<std::mutex> lock(mutex_);
   next_attempt_ = Steady::now() + std::chrono::duration_cast<Steady::duration>(
                                       std::chrono::duration<double>(parameters_.retry_period_s));
-  stage_ = open_();
+  if (!stage) {
+    missingLocked(reading_.fault.empty() ? "not connected" : reading_.fault, problem);
+    return;
+  }
+  stage_ = std::move(stage);
   const device::StageIdentity identity = stage_->identity();
   diagnostics_.setHardwareID(identity.serial);
   ROS_INFO_STREAM("opened " << printable(identity.vendor + " " + identity.model + " (" +
                                          identity.serial + ")"));
   told_problem_.clear();
-  return true;
+}
+
+void StageDriver::missingLocked(const std::string& fault, const std::string& problem) {
+  reading_.velocity_mps = 0.0;
+  reading_.moving = false;
+  reading_.homed = false;
+  reading_.fault = fault;
+  if (parameters_.required) failed_ = true;
+  if (problem == told_problem_) return;
+  told_problem_ = problem;
+  ROS_WARN_STREAM("no stage" << (parameters_.required
+                                     ? ""
+                                     : ", trying again every " +
+                                           formatNumber(parameters_.retry_period_s) + " s")
+                             << ": " << printable(problem, 1000));
 }
 
 void StageDriver::lostLocked(const std::string& problem) {
-  const bool was_open = stage_ != nullptr;
-  stage_.reset();
+  const std::unique_ptr<device::Stage> stage = std::move(stage_);
   homing_ = false;
-  if (was_open) {
-    reading_.stamp = device::now();
-    reading_.velocity_mps = 0.0;
-    reading_.moving = false;
-    reading_.homed = false;
-    reading_.fault = "link lost";
-    publishLocked(reading_);
-  }
+  missingLocked("link lost", problem);
+  publishLocked(reading_);
   finishLocked(Outcome::kAborted, "the stage was lost: " + problem);
-  if (problem == told_problem_) return;
-  told_problem_ = problem;
-  ROS_WARN_STREAM("no stage, trying again every " << parameters_.retry_period_s
-                                                  << " s: " << printable(problem, 1000));
+  if (!stage) return;
+  try {
+    stage->stop();
+  } catch (const std::exception&) {
+    // It does not hear us; if it still moves when it comes back, it is stopped then.
+  }
 }
 
 void StageDriver::pollLocked() {
-  if (!openLocked()) return;
   reading_ = stage_->read();
+  for (const std::string& remark : stage_->takeRemarks()) {
+    ROS_WARN_STREAM(printable(remark, 1000));
+  }
   if (reading_.moving) seen_moving_ = true;
   if (homing_ && motionOverLocked(reading_)) {
     homing_ = false;
@@ -149,10 +226,26 @@ void StageDriver::pollLocked() {
 }
 
 void StageDriver::publishLocked(const device::StageReading& reading) {
-  const ros::Time stamp = toRosTime(reading.stamp);
-  const Pose pose(Eigen::Translation3d(parameters_.axis * reading.position_m));
-  transforms_.sendTransform(
-      toTransformStamped(pose, stamp, parameters_.frame_id, parameters_.child_frame_id));
+  // Of a stage that was never there nothing was ever read, but it can be said since when.
+  const bool known = reading.stamp != device::Stamp();
+  const ros::Time stamp = known ? toRosTime(reading.stamp) : ros::Time::now();
+  if (known && parameters_.publish_tf && reading.stamp != transform_stamp_) {
+    transform_stamp_ = reading.stamp;
+    const Pose pose(Eigen::Translation3d(parameters_.axis * reading.position_m));
+    transforms_.sendTransform(
+        toTransformStamped(pose, stamp, parameters_.frame_id, parameters_.child_frame_id));
+  }
+
+  StageState state;
+  state.header.stamp = stamp;
+  state.header.frame_id = parameters_.frame_id;
+  state.position = known ? reading.position_m : std::nan("");
+  state.velocity = reading.velocity_mps;
+  state.homed = reading.homed;
+  state.moving = reading.moving;
+  state.fault = reading.fault;
+  state_publisher_.publish(state);
+  if (!stage_ || !joint_publisher_) return;
 
   sensor_msgs::JointState joint;
   joint.header.stamp = stamp;
@@ -160,16 +253,6 @@ void StageDriver::publishLocked(const device::StageReading& reading) {
   joint.position = {reading.position_m};
   joint.velocity = {reading.velocity_mps};
   joint_publisher_.publish(joint);
-
-  StageState state;
-  state.header.stamp = stamp;
-  state.header.frame_id = parameters_.frame_id;
-  state.position = reading.position_m;
-  state.velocity = reading.velocity_mps;
-  state.homed = reading.homed;
-  state.moving = reading.moving;
-  state.fault = reading.fault;
-  state_publisher_.publish(state);
 }
 
 bool StageDriver::motionOverLocked(const device::StageReading& reading) const {
@@ -188,14 +271,22 @@ void StageDriver::superviseLocked(const device::StageReading& reading) {
     told_fault_ = reading.fault;
     if (!reading.fault.empty()) ROS_WARN_STREAM("stage fault: " << printable(reading.fault));
   }
-  if (std::abs(reading.position_m - progress_position_m_) > kProgress) {
+  // A device that gives no readings while it homes, or few, makes progress by giving one.
+  if (std::abs(reading.position_m - progress_position_m_) > kProgress ||
+      (reading.stamp == progress_stamp_ && homing_)) {
     progress_position_m_ = reading.position_m;
     progress_at_ = Steady::now();
   }
+  progress_stamp_ = reading.stamp;
   if (!reading.fault.empty()) {
     if (reading.moving) stage_->stop();
     homing_ = false;
     finishLocked(Outcome::kAborted, "the stage has the fault \"" + reading.fault + "\"");
+    return;
+  }
+  if (goal_ && reading.reference != goal_->reference) {
+    if (reading.moving) stage_->stop();
+    finishLocked(Outcome::kAborted, "the stage lost its reference on the way");
     return;
   }
   const bool ours = goal_ || homing_;
@@ -208,6 +299,15 @@ void StageDriver::superviseLocked(const device::StageReading& reading) {
     homing_ = false;
     progress_at_ = Steady::now();
     if (goal_) goal_->ending = Ending::kStall;
+  }
+  const double took = std::chrono::duration<double>(Steady::now() - began_).count();
+  const double allowed = homing_ ? parameters_.home_timeout_s : parameters_.move_timeout_s;
+  if (ours && reading.moving && took > allowed &&
+      (homing_ || (goal_ && goal_->ending == Ending::kArrive))) {
+    ROS_WARN_STREAM("the stage takes longer than " << allowed << " s, stopping it");
+    stage_->stop();
+    homing_ = false;
+    if (goal_) goal_->ending = Ending::kTimeout;
   }
   if (!goal_) return;
   MoveStageFeedback feedback;
@@ -226,6 +326,10 @@ void StageDriver::superviseLocked(const device::StageReading& reading) {
     case Ending::kStall:
       finishLocked(Outcome::kAborted, "the stage made no progress for " +
                                           formatNumber(parameters_.stall_timeout_s) + " s");
+      break;
+    case Ending::kTimeout:
+      finishLocked(Outcome::kAborted, "the stage did not arrive within " +
+                                          formatNumber(parameters_.move_timeout_s) + " s");
       break;
     case Ending::kArrive:
       if (there) {
@@ -266,7 +370,10 @@ void StageDriver::finishLocked(Outcome outcome, const std::string& message) {
 }
 
 device::Stage& StageDriver::stageLocked() {
-  if (!stage_) throw device::StageError("there is no stage");
+  if (!stage_) {
+    throw device::StageError("there is no stage" +
+                             (told_problem_.empty() ? std::string() : ": " + told_problem_));
+  }
   return *stage_;
 }
 
@@ -313,6 +420,7 @@ void StageDriver::onGoal(Server::GoalHandle handle) {
     goal_.emplace();
     goal_->handle = std::move(handle);
     goal_->target_m = target;
+    goal_->reference = reading_.reference;
     beganLocked();
   } catch (const std::exception& e) {
     ROS_WARN_STREAM("move_stage refused: " << printable(e.what(), 1000));

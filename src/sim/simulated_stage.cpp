@@ -135,6 +135,7 @@ void SimulatedStage::updateLocked(Stamp time) {
     homing_ = false;
     homed_ = true;
     counter_offset_ = 0.0;
+    ++reference_;
   }
   if (hits_end_) {
     hits_end_ = false;
@@ -164,6 +165,7 @@ device::StageReading SimulatedStage::read() {
   reading.homed = homed_;
   reading.moving = time < motion.end();
   reading.fault = fault_;
+  reading.reference = reference_;
   return reading;
 }
 
@@ -230,6 +232,20 @@ void SimulatedStage::stall() {
   hits_end_ = false;
   homed_ = false;
   fault_ = "stalled";
+  ++reference_;
+}
+
+void SimulatedStage::powerCycle() {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  const Stamp time = clock_();
+  const double position = motions_.back().position(time);
+  beginLocked(MotionProfile(time, position));
+  counter_offset_ = position;
+  homing_ = false;
+  hits_end_ = false;
+  homed_ = false;
+  fault_.clear();
+  ++reference_;
 }
 
 }  // namespace omnister::sim

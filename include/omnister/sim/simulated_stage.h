@@ -74,6 +74,8 @@ class SimulatedStage : public device::Stage {
 
   /// The motor stalls now: stops at once, loses its reference, fault "stalled".
   void stall();
+  /// The power goes and comes: stops at once, counts from 0 here, without a reference or a fault.
+  void powerCycle();
 
  private:
   double truePositionLocked(Stamp time) const;
@@ -89,6 +91,7 @@ class SimulatedStage : public device::Stage {
   bool homed_ = false;
   bool homing_ = false;
   bool hits_end_ = false;  // the motion under way runs into an end of the travel
+  std::uint64_t reference_ = 0;
   std::string fault_;
 };
 
