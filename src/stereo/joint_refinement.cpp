@@ -24,7 +24,7 @@ constexpr float kLargestStep = 1.0f;  ///< of one iteration, in the widest posit
 constexpr float kNear = 2.0f;         ///< that neighbours on one surface differ by at most [px]
 constexpr float kNoise = 3.0f;        ///< variance that windows may differ by for nothing
 constexpr float kUnlike = 2.5f;       ///< times the better half's variance: hidden
-constexpr float kChance = 0.3f;       ///< times the reference's variance: not the same
+constexpr float kChance = 0.5f;       ///< times the reference's variance: not the same
 constexpr float kDependence = 4.0f;   ///< of neighbouring grey values, in variance
 constexpr float kLeastShare = 0.5f;   ///< of a window that must be in the image
 
@@ -97,7 +97,7 @@ void smoothSurface(const cv::Mat& in, float near, int threads, cv::Mat* out) {
 
 }  // namespace
 
-ProjectionTable::ProjectionTable(const sweep::WideLens& wide, cv::Size size) {
+ProjectionTable::ProjectionTable(const sweep::WideLens& wide, cv::Size size, int threads) {
   const LensModel& lens = *wide.lens;
   const auto ahead = lens.project(Eigen::Vector3d::UnitZ());
   const auto beside = lens.project(Eigen::Vector3d(std::sin(0.01), 0.0, std::cos(0.01)));
@@ -112,7 +112,8 @@ ProjectionTable::ProjectionTable(const sweep::WideLens& wide, cv::Size size) {
   scale_ = static_cast<float>(0.5 * (nodes_ - 3) / reach);
   middle_ = 0.5f * static_cast<float>(nodes_ - 1);
   table_.resize(static_cast<std::size_t>(nodes_) * nodes_);
-  for (int j = 0; j < nodes_; ++j) {
+  parallelFor(0, static_cast<std::size_t>(nodes_), threads, [&](std::size_t row) {
+    const int j = static_cast<int>(row);
     for (int i = 0; i < nodes_; ++i) {
       const double x = (i - middle_) / scale_, y = (j - middle_) / scale_;
       const double square = x * x + y * y;  // of tan(theta / 2)
@@ -123,7 +124,7 @@ ProjectionTable::ProjectionTable(const sweep::WideLens& wide, cv::Size size) {
           near ? cv::Vec2f(static_cast<float>(pixel->x()), static_cast<float>(pixel->y()))
                : cv::Vec2f(kNaN, kNaN);
     }
-  }
+  });
 }
 
 void ProjectionTable::project(const float* dx, const float* dy, const float* dz, int count,
@@ -162,14 +163,17 @@ struct JointRefinement::Strip {
   };
   std::vector<Image> images;
   std::vector<float> line, d[6], u, v, u1, v1, value, box;
-  std::vector<cv::Vec3f> rays, nodes;
+  std::vector<cv::Vec3f> rays, full_rays, nodes;
   std::vector<float> cross, slopes, rest, known;  ///< of the normal equations
   std::vector<float> own_sum, own_square, best;
 };
 
-JointRefinement::JointRefinement(const StereoGeometry& geometry, int threads)
+JointRefinement::JointRefinement(const StereoGeometry& geometry, int threads, int scale,
+                                 float prior_px)
     : geometry_(geometry),
       threads_(threads),
+      scale_(scale),
+      prior_px_(prior_px),
       rays_(*geometry.reference_lens, geometry.reference_size, threads) {
   std::vector<const LensModel*> lenses;
   std::vector<cv::Size> sizes;
@@ -180,27 +184,38 @@ JointRefinement::JointRefinement(const StereoGeometry& geometry, int threads)
     if (i == lenses.size()) {
       lenses.push_back(displaced.lens.get());
       sizes.push_back(displaced.size);
-      tables_.emplace_back(sweep::widen(displaced.lens), displaced.size);
+      tables_.emplace_back(sweep::widen(displaced.lens), displaced.size, threads);
     }
     table_of_.push_back(i);
-    widest_ = std::max(widest_, static_cast<float>(tables_[i].focalPx() *
-                                                   displaced.T_ref_disp.translation().norm()));
+    widest_ =
+        std::max(widest_, static_cast<float>(tables_[i].focalPx() *
+                                             displaced.T_ref_disp.translation().norm() / scale_));
   }
 }
 
 std::size_t JointRefinement::refine(const cv::Mat& reference, const std::vector<cv::Mat>& displaced,
                                     const cv::Mat& support, cv::Mat* inverse,
                                     cv::Mat* weight) const {
-  const auto smooth = [](const cv::Mat& image) {
+  const auto smooth = [&](const cv::Mat& image) {
     cv::Mat out;
-    cv::GaussianBlur(image, out, {3, 3}, 0.6);
+    if (scale_ == 1) {
+      cv::GaussianBlur(image, out, {3, 3}, 0.6);
+      return out;
+    }
+    const int right = (scale_ - image.cols % scale_) % scale_;
+    const int bottom = (scale_ - image.rows % scale_) % scale_;
+    cv::Mat whole = image;
+    if (right + bottom > 0)
+      cv::copyMakeBorder(image, whole, 0, bottom, 0, right, cv::BORDER_REPLICATE);
+    cv::resize(whole, out, whole.size() / scale_, 0, 0, cv::INTER_AREA);
+    cv::GaussianBlur(out, out, {3, 3}, 0.6);
     return out;
   };
   const cv::Mat own = smooth(reference);
   std::vector<cv::Mat> others;
   for (const cv::Mat& image : displaced) others.push_back(smooth(image));
   tbb::enumerable_thread_specific<Strip> strips;
-  const int height = reference.rows;
+  const int height = own.rows;
   std::vector<std::size_t> gone((height + kStripRows - 1) / kStripRows, 0);
   cv::Mat next(inverse->size(), CV_32FC1), next_weight(inverse->size(), CV_32FC1);
   for (int iteration = 0; iteration < kIterations; ++iteration) {
@@ -217,6 +232,22 @@ std::size_t JointRefinement::refine(const cv::Mat& reference, const std::vector<
   std::size_t all = 0;
   for (const std::size_t g : gone) all += g;
   return all;
+}
+
+void JointRefinement::raysOf(int y, int width, Strip* strip) const {
+  if (scale_ == 1) return rays_.row(y, strip->nodes, strip->rays.data());
+  // The ray of a reduced pixel is the mean of those it covers.
+  const cv::Size full = geometry_.reference_size;
+  strip->full_rays.resize(full.width + 16);
+  std::fill(strip->rays.begin(), strip->rays.end(), cv::Vec3f(0, 0, 0));
+  for (int v = y * scale_; v < std::min((y + 1) * scale_, full.height); ++v) {
+    rays_.row(v, strip->nodes, strip->full_rays.data());
+    for (int u = 0; u < full.width; ++u) strip->rays[u / scale_] += strip->full_rays[u];
+  }
+  for (int x = 0; x < width; ++x) {
+    cv::Vec3f& ray = strip->rays[x];
+    ray *= 1.0f / std::sqrt(ray.dot(ray));
+  }
 }
 
 std::size_t JointRefinement::refineStrip(int begin, int end, const cv::Mat& reference,
@@ -240,7 +271,7 @@ std::size_t JointRefinement::refineStrip(int begin, int end, const cv::Mat& refe
   for (int r = 0; r < rows; ++r) {
     const int y = begin - 2 * kRadius + r;
     if (y < 0 || y >= height) continue;
-    rays_.row(y, strip->nodes, strip->rays.data());
+    raysOf(y, width, strip);
     const float* w = inverse.ptr<float>(y);
     const std::uint8_t* own = reference.ptr(y);
     for (std::size_t k = 0; k < count; ++k) {
@@ -249,7 +280,8 @@ std::size_t JointRefinement::refineStrip(int begin, int end, const cv::Mat& refe
       const ProjectionTable& table = tables_[table_of_[k]];
       const Eigen::Matrix3f R = camera.T_ref_disp.linear().transpose().cast<float>();
       const Eigen::Vector3f t = R * camera.T_ref_disp.translation().cast<float>();
-      const float probe = kProbe / static_cast<float>(table.focalPx() * t.norm());
+      const float probe =
+          kProbe * static_cast<float>(scale_ / (table.focalPx() * static_cast<double>(t.norm())));
       float* d[6];
       for (int i = 0; i < 6; ++i) d[i] = strip->d[i].data();
       for (int x = 0; x < width; ++x) {
@@ -262,6 +294,12 @@ std::size_t JointRefinement::refineStrip(int begin, int end, const cv::Mat& refe
       }
       table.project(d[0], d[1], d[2], width, strip->u.data(), strip->v.data());
       table.project(d[3], d[4], d[5], width, strip->u1.data(), strip->v1.data());
+      if (scale_ > 1) {
+        // Pixel (0, 0) is the middle of the first pixel, whatever its size.
+        const float per = 1.0f / static_cast<float>(scale_);
+        for (auto* line : {&strip->u, &strip->v, &strip->u1, &strip->v1})
+          for (float& at : *line) at = (at + 0.5f) * per - 0.5f;
+      }
       const cv::Mat& other = displaced[k];
       const int step = static_cast<int>(other.step);
       const float right = static_cast<float>(other.cols) - 2.001f;
@@ -365,6 +403,7 @@ std::size_t JointRefinement::refineStrip(int begin, int end, const cv::Mat& refe
   boxSum(strip->known, inner, width, width, &strip->line, &strip->known);
 
   const float most = kLargestStep / widest_;
+  const float prior = widest_ * widest_ / (prior_px_ * prior_px_);
   std::size_t gone = 0;
   for (int y = begin; y < end; ++y) {
     const std::size_t at = static_cast<std::size_t>(y - begin) * width;
@@ -388,10 +427,14 @@ std::size_t JointRefinement::refineStrip(int begin, int end, const cv::Mat& refe
         ++gone;
         continue;
       }
-      out[x] += std::clamp(-strip->cross[at + x] / square, -most, most);
       const float cross = strip->cross[at + x];
-      const float variance = std::max(strip->rest[at + x] - cross * cross / square, 0.0f) / known;
-      out_weight[x] = square / (kDependence * (variance + 0.1f));
+      const float variance =
+          kDependence *
+          (std::max(strip->rest[at + x] - cross * cross / square, 0.0f) / known + 0.1f);
+      // What is known before holds windows without texture where they are.
+      const float steady = square + variance * prior;
+      out[x] += std::clamp(-cross / steady, -most, most);
+      out_weight[x] = steady / variance;
     }
   }
   return gone;

@@ -24,7 +24,7 @@ namespace omnister {
 class ProjectionTable {
  public:
   /// @throws Error for a lens without an image of its own axis
-  ProjectionTable(const sweep::WideLens& lens, cv::Size size);
+  ProjectionTable(const sweep::WideLens& lens, cv::Size size, int threads);
 
   /// For `count` directions of any length > 0: pixels, NaN outside the field.
   void project(const float* dx, const float* dy, const float* dz, int count, float* u,
@@ -41,10 +41,14 @@ class ProjectionTable {
 
 class JointRefinement {
  public:
-  JointRefinement(const StereoGeometry& geometry, int threads);
+  /// @param scale images are reduced so many times first: 1, 2, ...; a reduced pixel u covers the
+  /// pixels [u scale, (u + 1) scale)
+  /// @param prior_px standard deviation of what it starts from, in the widest reduced image [px]
+  JointRefinement(const StereoGeometry& geometry, int threads, int scale = 1,
+                  float prior_px = 2.0f);
 
   /// Improves inverse ranges in place.
-  /// @param reference, displaced CV_8UC1
+  /// @param reference, displaced CV_8UC1, in full size; the others are as large as reduced images
   /// @param inverse CV_32FC1, one over range along the ray [1/m]; NaN where unknown
   /// @param weight [in, out] CV_32FC1, one over the variance of inverse [m^2]
   /// @param support CV_8UC1, how many positions found that range
@@ -54,6 +58,7 @@ class JointRefinement {
 
  private:
   struct Strip;
+  void raysOf(int y, int width, Strip* strip) const;
   std::size_t refineStrip(int begin, int end, const cv::Mat& reference,
                           const std::vector<cv::Mat>& displaced, const cv::Mat& support,
                           const cv::Mat& inverse, const cv::Mat& weight, cv::Mat* inverse_out,
@@ -61,6 +66,8 @@ class JointRefinement {
 
   StereoGeometry geometry_;
   int threads_;
+  int scale_;
+  float prior_px_;
   PointMaker rays_;
   std::vector<ProjectionTable> tables_;  ///< by lens
   std::vector<std::size_t> table_of_;    ///< by displaced image

@@ -16,6 +16,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
 #include "omnister/stereo/matching_limits.h"
+#include "sweep_fill.h"
 #include "sweep_filters.h"
 #include "sweep_geometry.h"
 #include "sweep_kernels.h"
@@ -43,10 +44,12 @@ constexpr float kClaimUnits = 4;                ///< of a column, in which claim
 constexpr int kClaimTolerance = 7;              ///< so many of these two may differ by
 constexpr float kClaimScale = 0.5f;             ///< spots a column of the claims image
 constexpr std::int32_t kUnclaimed = std::numeric_limits<std::int32_t>::max();
-constexpr float kEdgeJump = 1.5f;     ///< columns between surfaces at an edge
-constexpr int kSpeckle = 100;         ///< regions of fewer pixels go,
-constexpr int kSpeckleShare = 3000;   ///< or of less than this part of the image
-constexpr float kWorstShare = 0.34f;  ///< of it, that a match may cost; chance gives a half
+constexpr float kEdgeJump = 1.5f;         ///< columns between surfaces at an edge
+constexpr int kSpeckle = 100;             ///< regions of fewer pixels go,
+constexpr int kSpeckleShare = 3000;       ///< or of less than this part of the image
+constexpr float kMatchedVariance = 4.0f;  ///< of matches in weak texture, times what costs say
+constexpr int kFilledCost = 300;          ///< of matches taken from coarser levels
+constexpr float kWorstShare = 0.34f;      ///< of it, that a match may cost; chance gives a half
 
 class Stopwatch {
  public:
@@ -119,7 +122,7 @@ cv::Mat makePlane(cv::Size size, int type, double value = -1) {
 class SweepMatcher : public SweepPair {
  public:
   SweepMatcher(const StereoGeometry& geometry, const MatcherOptions& options)
-      : geometry_(geometry), options_(options) {
+      : geometry_(geometry), options_(options), weak_fill_(geometry, options.threads) {
     const auto& displaced = geometry.displaced.front();
     frame_ = makeEpipolarFrame(displaced.T_ref_disp.translation());
     const WideLens reference_lens = widen(geometry.reference_lens);
@@ -177,7 +180,7 @@ class SweepMatcher : public SweepPair {
       matchLevel(l);
       watch.lap(l == 0 ? "match" : "coarse");
     }
-    finish(&result, &watch);
+    finish(reference, displaced.front(), &result, &watch);
     result.statistics.seconds["total"] =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     return result;
@@ -798,7 +801,8 @@ class SweepMatcher : public SweepPair {
     return all.front();
   }
 
-  void finish(MatchResult* result, Stopwatch* watch) {
+  void finish(const cv::Mat& reference, const cv::Mat& displaced, MatchResult* result,
+              Stopwatch* watch) {
     Level& level = levels_.front();
     const int width = level.map.size.width, height = level.map.size.height;
     constexpr int kStrip = 16;
@@ -882,6 +886,8 @@ class SweepMatcher : public SweepPair {
         removeSpeckles(&smooth, finest_step_, std::max(kSpeckle, width * height / kSpeckleShare),
                        options_.threads);
     watch->lap("speckle");
+    fillFromCoarse(reference, displaced, &smooth, &rejected);
+    watch->lap("fill");
 
     std::vector<TriangulateJob> points(strips);
     forRows([&](std::size_t s, int begin, int end) {
@@ -916,8 +922,54 @@ class SweepMatcher : public SweepPair {
     watch->lap("triangulate");
   }
 
+  /// Weak texture: what coarser levels matched.
+  void fillFromCoarse(const cv::Mat& reference, const cv::Mat& displaced, cv::Mat* smooth,
+                      std::map<std::string, std::size_t>* rejected) {
+    if (levels_.size() < 2) return;
+    const Level& level = levels_.front();
+    WeakFill::Job job;
+    job.reference = reference;
+    job.displaced = displaced;
+    job.half = &levels_[1].map;
+    job.baseline = static_cast<float>(frame_.baseline);
+    job.map = &level.map;
+    job.certainty = [&](int x, int y) {
+      const float cost = static_cast<float>(cost_.at<std::uint16_t>(y, x));
+      const float steep = std::max<float>(steep_.at<std::uint16_t>(y, x), 1.0f);
+      const float spread = (0.35f * std::sqrt(cost + 20.0f) / steep + 0.05f) * finest_step_;
+      return 1 / (kMatchedVariance * spread * spread);
+    };
+    job.step = finest_step_;
+    for (std::size_t l = 1; l < levels_.size(); ++l) {
+      float step = std::numeric_limits<float>::max();
+      for (const Band& band : levels_[l].grid.bands)
+        step = std::min(step, static_cast<float>(band.step_h));
+      job.coarse.push_back({&levels_[l].h, step});
+    }
+    job.least_region = std::max(kSpeckle, level.map.size.area() / kSpeckleShare);
+    cv::Mat sigma;
+    const std::size_t filled = weak_fill_.fill(job, smooth, &sigma);
+    if (filled == 0) return;
+    (*rejected)["speckle"] -= std::min((*rejected)["speckle"], filled);
+    // Costs from which triangulation makes that sigma again.
+    parallelFor(0, static_cast<std::size_t>(sigma.rows), options_.threads, [&](std::size_t row) {
+      const int y = static_cast<int>(row);
+      const float* spread = sigma.ptr<float>(y);
+      std::uint16_t* cost = cost_.ptr<std::uint16_t>(y);
+      std::uint16_t* steep = steep_.ptr<std::uint16_t>(y);
+      for (int x = 0; x < sigma.cols; ++x) {
+        if (std::isnan(spread[x])) continue;
+        cost[x] = kFilledCost;
+        const float columns = std::max(spread[x] / finest_step_ - 0.05f, 0.02f);
+        const float slope = 0.35f * std::sqrt(kFilledCost + 20.0f) / columns;
+        steep[x] = static_cast<std::uint16_t>(std::clamp(slope, 1.0f, 1000.0f));
+      }
+    });
+  }
+
   StereoGeometry geometry_;
   MatcherOptions options_;
+  WeakFill weak_fill_;
   EpipolarFrame frame_;
   std::vector<Level> levels_;
   std::unique_ptr<tbb::enumerable_thread_specific<Scratch>> scratch_ =
@@ -937,7 +989,8 @@ std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
                                           const MatcherOptions& options) {
   checkMatching(geometry, options);
   sweep::holdSimdByEnvironment();
-  if (geometry.displaced.size() > 1) return makeMultiPositionMatcher(geometry, options);
+  if (geometry.displaced.size() > 1 || options.refine)
+    return makeMultiPositionMatcher(geometry, options);
   return std::make_unique<SweepMatcher>(geometry, options);
 }
 

@@ -349,6 +349,9 @@ void addStereo(CLI::App& app) {
       ->capture_default_str();
   command->add_option("--thesis-window", arguments->thesis_window, "Side of that mask, odd [px]")
       ->capture_default_str();
+  command->add_flag("--refine", arguments->options.refine,
+                    "Let grey values have the last word on a pair's ranges: half the error for a few "
+                    "times the time; several displaced images always are refined");
   command->add_option("--threads", arguments->options.threads, "Threads; 0: every core")
       ->capture_default_str();
   command

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <iostream>
 #include <limits>
 #include <random>
 
@@ -247,6 +248,54 @@ TEST(MultiPosition, LimitsOfRangeAndMaskHold) {
   EXPECT_GT(valid, 4000u);
 }
 
+TEST(Refinement, HalvesTheErrorOfAPair) {
+  const auto everywhere = [](int x, int y) { return seen(scan(), x, y, scan().poses[1]); };
+  MatcherOptions options;
+  const Quality plain = judge(scan().match({1}, options), everywhere);
+  options.refine = true;
+  const Quality refined = judge(scan().match({1}, options), everywhere);
+  EXPECT_LT(refined.median(), 0.7 * plain.median());
+  EXPECT_GT(refined.density(), plain.density() - 0.03);
+}
+
+TEST(WeakTexture, MatchesInCoarserImages) {
+  // Walls of a few grey levels under noise of nearly one.
+  StereoGeometry geometry = scan().geometry({2});
+  const auto fade = [](const cv::Mat& image, unsigned seed) {
+    cv::Mat faded;
+    image.convertTo(faded, CV_8U, 0.07, 119);
+    addNoise(&faded, 0.8, seed);
+    return faded;
+  };
+  const auto walls = test::room(1.9, 0.12);
+  const test::View reference = test::look(walls, *lens(), kSize, Pose::Identity(), 2);
+  const cv::Mat displaced = test::look(walls, *lens(), kSize, scan().poses[2], 2).image;
+  MatcherOptions options;
+  options.min_range = 0.7;
+  const MatchResult result = makeMatcher("sweep", geometry, options)
+                                 ->match(fade(reference.image, 5), {fade(displaced, 6)});
+  std::vector<double> errors, z;
+  int truth = 0;
+  for (int y = 4; y < kSize.height - 4; ++y) {
+    for (int x = 4; x < kSize.width - 4; ++x) {
+      const double range = reference.range.at<double>(y, x);
+      const auto ray = lens()->unproject({static_cast<double>(x), static_cast<double>(y)});
+      if (std::isnan(range) || !ray || std::abs(ray->x()) > 0.9) continue;
+      if (!lens()->project(range * *ray - scan().poses[2].translation())) continue;
+      ++truth;
+      const double found = result.range.at<float>(y, x);
+      if (std::isnan(found)) continue;
+      errors.push_back(std::abs(found / range - 1));
+      z.push_back(std::abs(found - range) / result.sigma.at<float>(y, x));
+    }
+  }
+  ASSERT_GT(truth, 20000);
+  std::cout << "density " << static_cast<double>(errors.size()) / truth << ", median "
+            << Quality::quantile(errors, 0.5) << ", z " << Quality::quantile(z, 0.6827) << '\n';
+  EXPECT_GT(static_cast<double>(errors.size()) / truth, 0.8);
+  EXPECT_LT(Quality::quantile(errors, 0.5), 0.03);
+}
+
 TEST(RangeFusion, TwoThatAgreeOutweighOneThatDoesNot) {
   RangeFusion fusion({2, 1}, 1);
   const auto add = [&](float first, float sigma, float second) {
@@ -275,7 +324,7 @@ TEST(ProjectionTable, FallsWhereTheLensSays) {
     structure.model = model;
     const cv::Size size(1280, 960);
     const LensPtr wide = makeLens(structure, {640, 480}, 400.0, 1.55);
-    const ProjectionTable table(sweep::widen(wide), size);
+    const ProjectionTable table(sweep::widen(wide), size, 1);
     EXPECT_NEAR(table.focalPx(), 400.0, 4.0);
     std::mt19937 random(3);
     int inside = 0, outside = 0;

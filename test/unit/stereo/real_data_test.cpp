@@ -121,7 +121,7 @@ TEST_P(CarFisheye, FivePositionsTightenThePavement) {
   const PlaneFit two = measure({middle + 1});
   const PlaneFit five = measure({middle - 2, middle - 1, middle + 1, middle + 2});
   EXPECT_LT(five.all.median_range_error, 0.9 * two.all.median_range_error);
-  EXPECT_GE(five.all.points, two.all.points);
+  EXPECT_GT(five.all.points, 0.99 * two.all.points);
 }
 
 INSTANTIATE_TEST_SUITE_P(, CarFisheye,
@@ -198,8 +198,8 @@ TEST(BoardRig, RangeOnTheBoardIsThatOfItsPlane) {
   std::cout << "median of medians " << 100.0 * quantile(medians, 0.5) << " %, worst "
             << 100.0 * quantile(medians, 1.0) << " %, coverage " << quantile(coverages, 0.5)
             << '\n';
-  EXPECT_LT(quantile(medians, 0.5), 0.01);
-  EXPECT_GT(quantile(coverages, 0.5), 0.15);
+  EXPECT_LT(quantile(medians, 0.5), 0.005);
+  EXPECT_GT(quantile(coverages, 0.5), 0.8);
 }
 
 }  // namespace
