@@ -6,11 +6,14 @@
 #include <cmath>
 #include <limits>
 #include <map>
-#include <opencv2/core/mat.hpp>
+#include <opencv2/core.hpp>
+#include <optional>
 #include <tuple>
+#include <utility>
 
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
+#include "sweep_kernels.h"
 
 namespace omnister::sweep {
 namespace {
@@ -84,96 +87,230 @@ double axisOf(Axis axis, double theta) {
   return axis == Axis::kAngle ? theta : -std::cos(theta) / std::max(std::sin(theta), 1e-6);
 }
 
+namespace {
+
+/// What a pixel is made from: rays at the corners of cells, and the lens where there are none.
+struct RayNodes {
+  const WideLens& lens;
+  const EpipolarFrame& frame;
+  Axis axis;
+  int scale;
+  int nodes_x;
+  Eigen::Vector3f axis_z;
+  std::vector<Eigen::Vector3f> nodes = {};  ///< (e, m, n), NaN where the lens has none
+
+  std::optional<Eigen::Vector3d> lensRay(int x, int y) const {
+    const auto ray =
+        lens.lens->unproject(Eigen::Vector2d((x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5));
+    if (!ray) return std::nullopt;
+    return Eigen::Vector3d(frame.basis * *ray);
+  }
+
+  /// Between the corners of a cell; NaN where one of the sixteen is.
+  Eigen::Vector3f between(int cell_x, int cell_y, const float* wx, const float* wy) const {
+    Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+    for (int j = 0; j < 4; ++j) {
+      const Eigen::Vector3f* row = &nodes[static_cast<std::size_t>(cell_y + j) * nodes_x + cell_x];
+      sum += wy[j] * (wx[0] * row[0] + wx[1] * row[1] + wx[2] * row[2] + wx[3] * row[3]);
+    }
+    return sum;
+  }
+
+  float depth(const Eigen::Vector3f& ray) const { return axis_z.dot(ray); }
+
+  /// phi [1 / kPhiUnits rad] and the axis coordinate.
+  std::pair<float, float> coordinates(const Eigen::Vector3f& ray) const {
+    const float radius = std::sqrt(ray.y() * ray.y() + ray.z() * ray.z());
+    const float angle = smoothAtan2(ray.z(), ray.y());
+    const float along = axis == Axis::kAngle ? smoothAtan2(radius, ray.x())
+                                             : -ray.x() / (radius > 1e-6f ? radius : 1e-6f);
+    return {(angle + static_cast<float>(kPi)) * static_cast<float>(kPhiUnits), along};
+  }
+};
+
+/// All, none or some of the mask's pixels under a cell.
+int maskOf(const cv::Mat& mask, const cv::Rect& pixels, int scale) {
+  if (mask.empty()) return 1;
+  bool some = false, all = true;
+  for (int y = pixels.y; y < pixels.br().y; ++y) {
+    for (int x = pixels.x; x < pixels.br().x; ++x) {
+      const cv::Rect under(x * scale, y * scale, scale, scale);
+      const bool seen = cv::countNonZero(mask(under & cv::Rect(cv::Point(), mask.size()))) > 0;
+      some = some || seen;
+      all = all && seen;
+    }
+  }
+  return all ? 1 : some ? 0 : -1;
+}
+
+}  // namespace
+
 ReferenceMap makeReferenceMap(const WideLens& lens, cv::Size full_size, int level,
                               const EpipolarFrame& frame, Axis axis, const cv::Mat& mask,
                               int threads) {
+  constexpr int kCell = ReferenceMap::kCell;
   const int scale = 1 << level;
   ReferenceMap map;
   map.size =
       cv::Size((full_size.width + scale - 1) / scale, (full_size.height + scale - 1) / scale);
   map.axis = axis;
-  const int width = map.size.width, height = map.size.height;
-  map.phi.assign(static_cast<std::size_t>(width) * height + kMapSlack, kNoRay);
-  map.a.assign(static_cast<std::size_t>(width) * height + kMapSlack, 0.0f);
-
-  const auto rayAt = [&](int x, int y) {
-    return lens.lens->unproject(Eigen::Vector2d((x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5));
-  };
-  // Rays at nodes, one beyond the cells on each side.
-  const int nodes_x = width / kNodeStep + 4, nodes_y = height / kNodeStep + 4;
-  std::vector<Eigen::Vector3f> nodes(static_cast<std::size_t>(nodes_x) * nodes_y);
+  map.cells = cv::Size((map.size.width + kCell - 1) / kCell, (map.size.height + kCell - 1) / kCell);
+  const int nodes_x = map.cells.width + 3, nodes_y = map.cells.height + 3;
+  RayNodes rays{lens, frame, axis, scale, nodes_x, frame.basis.col(2).cast<float>()};
+  rays.nodes.resize(static_cast<std::size_t>(nodes_x) * nodes_y);
+  map.node_phi.assign(rays.nodes.size() + 64, kNaN);
+  map.node_a.assign(rays.nodes.size() + 64, kNaN);
   parallelFor(0, nodes_y, threads, [&](std::size_t j) {
     for (int i = 0; i < nodes_x; ++i) {
-      const auto ray = rayAt((i - 1) * kNodeStep, (static_cast<int>(j) - 1) * kNodeStep);
-      nodes[j * nodes_x + i] = ray ? Eigen::Vector3f((frame.basis * *ray).cast<float>())
-                                   : Eigen::Vector3f::Constant(kNaN);
+      const std::size_t n = j * nodes_x + i;
+      const auto ray = rays.lensRay((i - 1) * kCell, (static_cast<int>(j) - 1) * kCell);
+      rays.nodes[n] = ray ? Eigen::Vector3f(ray->cast<float>()) : Eigen::Vector3f::Constant(kNaN);
+      if (ray) std::tie(map.node_phi[n], map.node_a[n]) = rays.coordinates(rays.nodes[n]);
     }
   });
 
-  std::array<std::array<float, 4>, kNodeStep> weights;
-  for (int i = 0; i < kNodeStep; ++i) weights[i] = cubicWeights(i / double(kNodeStep));
-  const Eigen::Vector3f axis_z = frame.basis.col(2).cast<float>();
+  std::array<std::array<float, 4>, kCell> weights;
+  for (int i = 0; i < kCell; ++i) weights[i] = cubicWeights(i / double(kCell));
   const float cos_max = static_cast<float>(lens.cos_max_theta);
-
-  parallelFor(0, height, threads, [&](std::size_t row) {
-    const int y = static_cast<int>(row);
-    const auto& wy = weights[y % kNodeStep];
-    const Eigen::Vector3f* cell_row = &nodes[static_cast<std::size_t>(y / kNodeStep) * nodes_x];
-    std::vector<Eigen::Vector3f> line(nodes_x);
-    for (int i = 0; i < nodes_x; ++i) {
-      line[i] = wy[0] * cell_row[i] + wy[1] * cell_row[nodes_x + i] +
-                wy[2] * cell_row[2 * nodes_x + i] + wy[3] * cell_row[3 * nodes_x + i];
-    }
-    std::uint16_t* phi = &map.phi[row * width];
-    float* a = &map.a[row * width];
-    for (int x0 = 0; x0 < width; x0 += kNodeStep) {
-      const Eigen::Vector3f* p = &line[x0 / kNodeStep];
-      const int count = std::min(kNodeStep, width - x0);
-      float ex[kNodeStep], mx[kNodeStep], nx[kNodeStep];
-      const float check = p[0].x() + p[1].x() + p[2].x() + p[3].x();
-      if (std::isfinite(check)) {
-        for (int i = 0; i < kNodeStep; ++i) {
-          const auto& w = weights[i];
-          ex[i] = w[0] * p[0].x() + w[1] * p[1].x() + w[2] * p[2].x() + w[3] * p[3].x();
-          mx[i] = w[0] * p[0].y() + w[1] * p[1].y() + w[2] * p[2].y() + w[3] * p[3].y();
-          nx[i] = w[0] * p[0].z() + w[1] * p[1].z() + w[2] * p[2].z() + w[3] * p[3].z();
+  const auto pixelsOf = [&](int i, int j) {
+    return cv::Rect(i * kCell, j * kCell, kCell, kCell) & cv::Rect(cv::Point(), map.size);
+  };
+  map.exact.assign(map.cells.area(), 0);
+  parallelFor(0, map.cells.height, threads, [&](std::size_t row) {
+    const int j = static_cast<int>(row);
+    for (int i = 0; i < map.cells.width; ++i) {
+      std::int32_t& kind = map.exact[row * map.cells.width + i];
+      const int masked = maskOf(mask, pixelsOf(i, j), scale);
+      int deep = 0, seen = 0;
+      bool finite = true;
+      for (int k = 0; k < 16; ++k) {
+        const Eigen::Vector3f& node =
+            rays.nodes[static_cast<std::size_t>(j + k / 4) * nodes_x + i + k % 4];
+        finite = finite && node.allFinite();
+        seen += rays.depth(node) >= cos_max;  // false for NaN
+        const bool corner = (k / 4 == 1 || k / 4 == 2) && (k % 4 == 1 || k % 4 == 2);
+        deep += corner && rays.depth(node) >= cos_max + 1e-4f;
+      }
+      // A field that hides between the corners is a small one.
+      if (masked < 0 || (seen == 0 && map.cells.area() > 64)) {
+        kind = ReferenceMap::kNothing;
+        continue;
+      }
+      if (!finite || deep < 4 || masked == 0) continue;
+      bool smooth = true;
+      for (const auto& [u, v] : {std::pair(8, 8), std::pair(4, 8), std::pair(12, 8),
+                                 std::pair(8, 4), std::pair(8, 12)}) {
+        const float *wx = weights[u].data(), *wy = weights[v].data();
+        const Eigen::Vector3f ray = rays.between(i, j, wx, wy);
+        const auto [phi, a] = rays.coordinates(ray);
+        float phi_between = 0, a_between = 0;
+        for (int k = 0; k < 16; ++k) {
+          const std::size_t n = static_cast<std::size_t>(j + k / 4) * nodes_x + i + k % 4;
+          phi_between += wy[k / 4] * wx[k % 4] * map.node_phi[n];
+          a_between += wy[k / 4] * wx[k % 4] * map.node_a[n];
         }
-      } else {
-        // Beyond what the lens can be widened to; ask it pixel by pixel.
-        for (int i = 0; i < kNodeStep; ++i) {
-          const auto ray = i < count ? rayAt(x0 + i, y) : std::nullopt;
-          const Eigen::Vector3d b =
-              ray ? Eigen::Vector3d(frame.basis * *ray) : Eigen::Vector3d::Constant(kNaN);
-          ex[i] = static_cast<float>(b.x());
-          mx[i] = static_cast<float>(b.y());
-          nx[i] = static_cast<float>(b.z());
-        }
+        // Both as angles between rays.
+        const float enough = 2e-5f * static_cast<float>(scale);
+        const float sine = std::sqrt(ray.y() * ray.y() + ray.z() * ray.z()) / ray.norm();
+        const float slope = axis == Axis::kAngle ? 1.0f : sine * sine;
+        smooth = smooth && std::fabs(a - a_between) * slope < enough &&
+                 std::fabs(phi - phi_between) * sine < enough * static_cast<float>(kPhiUnits);
       }
-      float angle[kNodeStep], along[kNodeStep], z[kNodeStep];
-      for (int i = 0; i < kNodeStep; ++i) {
-        const float radius = std::sqrt(mx[i] * mx[i] + nx[i] * nx[i]);
-        angle[i] = smoothAtan2(nx[i], mx[i]);
-        along[i] = axis == Axis::kAngle ? smoothAtan2(radius, ex[i])
-                                        : -ex[i] / (radius > 1e-6f ? radius : 1e-6f);
-        z[i] = axis_z.x() * ex[i] + axis_z.y() * mx[i] + axis_z.z() * nx[i];
-      }
-      for (int i = 0; i < count; ++i) {
-        if (!(z[i] >= cos_max)) continue;  // also NaN
-        phi[x0 + i] = static_cast<std::uint16_t>(std::lround((angle[i] + kPi) * kPhiUnits));
-        a[x0 + i] = along[i];
-      }
+      if (smooth) kind = ReferenceMap::kInterpolated;
     }
-    if (!mask.empty()) {
-      for (int x = 0; x < width; ++x) {
-        bool seen = false;
-        for (int v = y * scale; v < std::min((y + 1) * scale, full_size.height); ++v)
-          for (int u = x * scale; u < std::min((x + 1) * scale, full_size.width); ++u)
-            seen = seen || mask.at<std::uint8_t>(v, u) != 0;
-        if (!seen) phi[x] = kNoRay;
+  });
+  std::int32_t count = 0;
+  std::vector<std::int32_t> cells;
+  for (std::int32_t cell = 0; cell < map.cells.area(); ++cell) {
+    if (map.exact[cell] == 0) {
+      map.exact[cell] = count++;
+      cells.push_back(cell);
+    } else if (map.exact[cell] == ReferenceMap::kInterpolated) {
+      map.field += pixelsOf(cell % map.cells.width, cell / map.cells.width).area();
+    }
+  }
+  map.exact_phi.assign(static_cast<std::size_t>(count) * kCell * kCell, kNoRay);
+  map.exact_a.assign(map.exact_phi.size(), 0.0f);
+  parallelFor(0, cells.size(), threads, [&](std::size_t c) {
+    const int i = cells[c] % map.cells.width, j = cells[c] / map.cells.width;
+    const cv::Rect pixels = pixelsOf(i, j);
+    for (int y = 0; y < pixels.height; ++y) {
+      for (int x = 0; x < pixels.width; ++x) {
+        const cv::Rect pixel(pixels.x + x, pixels.y + y, 1, 1);
+        if (maskOf(mask, pixel, scale) < 0) continue;
+        Eigen::Vector3f ray = rays.between(i, j, weights[x].data(), weights[y].data());
+        if (!ray.allFinite()) {
+          // Beyond what the lens can be widened to; ask it pixel by pixel.
+          const auto exact = rays.lensRay(pixel.x, pixel.y);
+          if (!exact) continue;
+          ray = exact->cast<float>();
+        }
+        if (!(rays.depth(ray) >= cos_max)) continue;
+        const std::size_t n = c * kCell * kCell + y * kCell + x;
+        const auto [phi, a] = rays.coordinates(ray);
+        map.exact_phi[n] = static_cast<std::uint16_t>(std::lround(phi));
+        map.exact_a[n] = a;
       }
     }
   });
+  map.field +=
+      map.exact_phi.size() - std::count(map.exact_phi.begin(), map.exact_phi.end(), kNoRay);
   return map;
+}
+
+void viewMap(const ReferenceMap& map, const cv::Rect& rect, MapView* view) {
+  constexpr int kCell = ReferenceMap::kCell;
+  const int first = std::max(rect.x, 0) / kCell;
+  const int last = (std::min(rect.br().x, map.size.width) - 1) / kCell;
+  view->size = map.size;
+  view->rect = rect;
+  view->left = std::min(first * kCell, rect.x);
+  view->stride = std::max((last + 1) * kCell, rect.br().x) - view->left + kCell;
+  const std::size_t room = static_cast<std::size_t>(view->stride) * rect.height + kCell;
+  if (view->phi.size() < room) {
+    view->phi.resize(room);
+    view->a.resize(room);
+  }
+  MapCellsJob job;
+  job.node_stride = map.cells.width + 3;
+  job.cells = last - first + 1;
+  const int from = first * kCell - view->left;
+  for (int y = rect.y; y < rect.br().y; ++y) {
+    const int v = std::clamp(y, 0, map.size.height - 1);
+    const int j = v / kCell;
+    const std::size_t row = static_cast<std::size_t>(y - rect.y) * view->stride;
+    std::uint16_t* phi = &view->phi[row];
+    float* a = &view->a[row];
+    const std::size_t node = static_cast<std::size_t>(j) * job.node_stride + first;
+    job.node_phi = &map.node_phi[node];
+    job.node_a = &map.node_a[node];
+    job.row = v % kCell;
+    job.phi = phi + from;
+    job.a = a + from;
+    mapCells(job);
+    for (int i = first; i <= last; ++i) {
+      const std::int32_t kind = map.exact[static_cast<std::size_t>(j) * map.cells.width + i];
+      if (kind == ReferenceMap::kInterpolated) continue;
+      const int x = from + (i - first) * kCell;
+      if (kind == ReferenceMap::kNothing) {
+        std::fill_n(phi + x, kCell, kNoRay);
+        std::fill_n(a + x, kCell, 0.0f);
+      } else {
+        const std::size_t n = (static_cast<std::size_t>(kind) * kCell + job.row) * kCell;
+        std::copy_n(&map.exact_phi[n], kCell, phi + x);
+        std::copy_n(&map.exact_a[n], kCell, a + x);
+      }
+    }
+    for (int x = view->left; x < 0; ++x) {
+      phi[x - view->left] = phi[-view->left];
+      a[x - view->left] = a[-view->left];
+    }
+    const int end = map.size.width - view->left;
+    for (int x = end; x < view->stride; ++x) {
+      phi[x] = phi[end - 1];
+      a[x] = a[end - 1];
+    }
+  }
 }
 
 void hypothesisRange(const HypothesisLimits& limits, double theta, double* least, double* most) {
@@ -191,15 +328,15 @@ void hypothesisRange(const HypothesisLimits& limits, double theta, double* least
   *most = std::max(*most, *least);
 }
 
-bool localFrame(const ReferenceMap& map, int x, int y, Eigen::Vector2f* d_phi,
-                Eigen::Vector2f* d_a) {
+bool localFrame(const MapView& view, int x, int y, Eigen::Vector2f* d_phi, Eigen::Vector2f* d_a) {
   constexpr int kReach = 4;
   const auto at = [&](int u, int v, float* phi, float* a) {
-    if (u < 0 || v < 0 || u >= map.size.width || v >= map.size.height) return false;
-    const std::size_t i = static_cast<std::size_t>(v) * map.size.width + u;
-    *phi = map.phi[i];
-    *a = map.a[i];
-    return map.phi[i] != kNoRay;
+    const cv::Point p(u, v);
+    if (!view.rect.contains(p) || !cv::Rect(cv::Point(), view.size).contains(p)) return false;
+    const std::size_t i = view.at(u, v);
+    *phi = view.phi[i];
+    *a = view.a[i];
+    return view.phi[i] != kNoRay;
   };
   // Derivative along (dx, dy): central where both neighbours have rays, else to one side.
   const auto derivative = [&](int dx, int dy, float* phi, float* a) {
@@ -228,6 +365,7 @@ bool localFrame(const ReferenceMap& map, int x, int y, Eigen::Vector2f* d_phi,
 
 Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::Size tile_size) {
   Layout layout;
+  MapView view;
   struct Scale {
     double phi = 0, a = 0;  ///< pixels per radian of phi and per unit of a
     bool left = false;      ///< theta below 90 degrees
@@ -240,13 +378,16 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
       Tile tile;
       tile.rect = cv::Rect(x, y, std::min(tile_size.width, map.size.width - x),
                            std::min(tile_size.height, map.size.height - y));
+      viewMap(map,
+              tile.rect + cv::Size(2 * kViewHalo, 2 * kViewHalo) - cv::Point(kViewHalo, kViewHalo),
+              &view);
       Scale scale;
       std::vector<double> phi, a;
       for (int v = tile.rect.y; v < tile.rect.br().y; v += 6) {
         for (int u = tile.rect.x; u < tile.rect.br().x; u += 6) {
           Eigen::Vector2f d_phi, d_a;
-          if (map.phi[static_cast<std::size_t>(v) * map.size.width + u] == kNoRay) continue;
-          if (!localFrame(map, u, v, &d_phi, &d_a)) continue;
+          if (view.phi[view.at(u, v)] == kNoRay) continue;
+          if (!localFrame(view, u, v, &d_phi, &d_a)) continue;
           phi.push_back(d_phi.norm());
           a.push_back(d_a.norm());
         }
@@ -254,10 +395,10 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
       float a_min = std::numeric_limits<float>::max(), a_max = -a_min;
       for (int v = tile.rect.y; v < tile.rect.br().y; ++v) {
         for (int u = tile.rect.x; u < tile.rect.br().x; ++u) {
-          const std::size_t i = static_cast<std::size_t>(v) * map.size.width + u;
-          if (map.phi[i] == kNoRay) continue;
-          a_min = std::min(a_min, map.a[i]);
-          a_max = std::max(a_max, map.a[i]);
+          const std::size_t i = view.at(u, v);
+          if (view.phi[i] == kNoRay) continue;
+          a_min = std::min(a_min, view.a[i]);
+          a_max = std::max(a_max, view.a[i]);
         }
       }
       if (!phi.empty() && a_min <= a_max) {
@@ -339,6 +480,7 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
   // Rows and columns that the tiles can reach.
   std::vector<std::pair<int, int>> row_range(
       grid.bands.size(), {std::numeric_limits<int>::max(), std::numeric_limits<int>::min()});
+  MapView view;
   const auto visit = [&](const auto& action) {
     for (const Tile& tile : layout->tiles) {
       if (tile.band < 0) continue;
@@ -346,14 +488,15 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
       const double to_row = 1.0 / (kPhiUnits * band.step_phi), row0 = -kPi / band.step_phi;
       const double to_column = column_sign_scale / band.step_h;
       const cv::Rect rect = tile.rect;
+      viewMap(map, rect + cv::Size(2 * halo, 2 * halo) - cv::Point(halo, halo), &view);
       for (int v = rect.y - halo;; v = std::min(v + kSample, rect.br().y + halo - 1)) {
         const int y = std::clamp(v, 0, map.size.height - 1);
         for (int u = rect.x - halo;; u = std::min(u + kSample, rect.br().x + halo - 1)) {
           const int x = std::clamp(u, 0, map.size.width - 1);
-          const std::size_t i = static_cast<std::size_t>(y) * map.size.width + x;
-          if (map.phi[i] != kNoRay) {
-            const int row = static_cast<int>(std::lround(map.phi[i] * to_row + row0));
-            const double column = map.a[i] * to_column;
+          const std::size_t i = view.at(x, y);
+          if (view.phi[i] != kNoRay) {
+            const int row = static_cast<int>(std::lround(view.phi[i] * to_row + row0));
+            const double column = view.a[i] * to_column;
             action(tile.band, row, static_cast<int>(std::floor(column + tile.h_min / band.step_h)),
                    static_cast<int>(std::ceil(column + tile.h_max / band.step_h)));
           }
@@ -548,9 +691,11 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
     if (tile.band < 0) return;
     const Band& band = grid.bands[tile.band];
     int first_row = band.rows, last_row = -1;
+    MapView view;
+    viewMap(map, tile.rect, &view);
     for (int y = tile.rect.y; y < tile.rect.br().y; ++y) {
       for (int x = tile.rect.x; x < tile.rect.br().x; ++x) {
-        const std::uint16_t phi = map.phi[static_cast<std::size_t>(y) * map.size.width + x];
+        const std::uint16_t phi = view.phi[view.at(x, y)];
         if (phi == kNoRay) continue;
         const int row = static_cast<int>(std::lround(phi * band.row_scale + band.row_offset));
         first_row = std::min(first_row, row);

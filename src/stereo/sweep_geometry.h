@@ -46,15 +46,22 @@ inline constexpr std::uint16_t kNoRay = 0xFFFF;
 /// phi in the units of ReferenceMap::phi per radian; 0 stands for -pi.
 inline constexpr double kPhiUnits = 65534.0 / 6.283185307179586;
 
-/// Elements behind the last pixel of a map, for vectors that reach past it.
-inline constexpr int kMapSlack = 64;
-
-/// Epipolar coordinates of every pixel of a (possibly reduced) reference image.
+/// Epipolar coordinates of every pixel of a (possibly reduced) reference image. They are kept at
+/// the corners of square cells with a cubic between, and pixel by pixel in cells at the edge of the
+/// field and near the epipoles, where that does not do.
 struct ReferenceMap {
+  static constexpr int kCell = 16;  ///< pixels
+  static constexpr std::int32_t kInterpolated = -1, kNothing = -2;
   cv::Size size;
   Axis axis = Axis::kAngle;
-  std::vector<std::uint16_t> phi;  ///< row-major, kNoRay where there is none
-  std::vector<float> a;            ///< axis coordinate
+  cv::Size cells;
+  /// Corners, the first one cell before the image; cells.width + 3 a row.
+  std::vector<float> node_phi;  ///< [1 / kPhiUnits rad]
+  std::vector<float> node_a;
+  std::vector<std::int32_t> exact;  ///< by cell: kInterpolated, kNothing or its place in the next
+  std::vector<std::uint16_t> exact_phi;
+  std::vector<float> exact_a;
+  std::size_t field = 0;  ///< pixels that have a ray
 };
 
 /// @param level the image is reduced 2^level times; pixel u of it is (u + 0.5) 2^level - 0.5
@@ -63,15 +70,33 @@ ReferenceMap makeReferenceMap(const WideLens& lens, cv::Size full_size, int leve
                               const EpipolarFrame& frame, Axis axis, const cv::Mat& mask,
                               int threads);
 
+/// Epipolar coordinates of a rectangle, pixel by pixel.
+struct MapView {
+  cv::Size size;  ///< of the image
+  cv::Rect rect;  ///< what is here, at least; pixels beyond the image are those at its edge
+  int left = 0, stride = 0;
+  std::vector<std::uint16_t> phi;  ///< kNoRay where there is no ray
+  std::vector<float> a;            ///< axis coordinate; anything where there is no ray
+
+  std::size_t at(int x, int y) const {
+    return static_cast<std::size_t>(y - rect.y) * stride + (x - left);
+  }
+};
+
+/// Fills a view; vectors may read 16 elements past the end of a row.
+void viewMap(const ReferenceMap& map, const cv::Rect& rect, MapView* view);
+
+/// Pixels around a tile that its local frames look at.
+inline constexpr int kViewHalo = 6;
+
 /// Axis coordinate to theta [rad] and back.
 double thetaOf(Axis axis, double a);
 double axisOf(Axis axis, double theta);
 
-/// Movement over the image along the two epipolar coordinates at a pixel.
+/// Movement over the image along the two epipolar coordinates at a pixel of the view.
 /// @param d_phi [out] [px/rad]  @param d_a [out] [px per unit of a]
 /// @return false where there are not enough rays around
-bool localFrame(const ReferenceMap& map, int x, int y, Eigen::Vector2f* d_phi,
-                Eigen::Vector2f* d_a);
+bool localFrame(const MapView& view, int x, int y, Eigen::Vector2f* d_phi, Eigen::Vector2f* d_a);
 
 /// A rectangle of the reference image that is matched at once.
 struct Tile {

@@ -402,6 +402,58 @@ HWY_INLINE V SineSmall(D d, V x) {
   return hn::Add(hn::Mul(hn::Mul(r, s), x), x);
 }
 
+void MapCells(const MapCellsJob& job) {
+  constexpr int kCell = 16, kBatch = 13;  // with three corners more, 16
+  const hn::CappedTag<float, kCell> d;
+  const hn::RebindToSigned<decltype(d)> di;
+  const hn::Rebind<std::uint16_t, decltype(d)> d16;
+  const int lanes = static_cast<int>(hn::Lanes(d));
+  const float t = static_cast<float>(job.row) / kCell;
+  const auto weight = [](int k, float s) {
+    if (k == 0) return -s * (s - 1) * (s - 2) / 6;
+    if (k == 1) return (s + 1) * (s - 1) * (s - 2) / 2;
+    if (k == 2) return -(s + 1) * s * (s - 2) / 2;
+    return (s + 1) * s * (s - 1) / 6;
+  };
+  struct Across {
+    HWY_ALIGN float w[4][kCell];
+  };
+  static const Across across = [&] {
+    Across table;
+    for (int k = 0; k < 4; ++k)
+      for (int i = 0; i < kCell; ++i) table.w[k][i] = weight(k, static_cast<float>(i) / kCell);
+    return table;
+  }();
+  HWY_ALIGN float phi[kCell], a[kCell];
+  for (int first = 0; first < job.cells; first += kBatch) {
+    for (int i = 0; i < kCell; i += lanes) {
+      auto p = hn::Zero(d), q = hn::Zero(d);
+      for (int k = 0; k < 4; ++k) {
+        const auto w = hn::Set(d, weight(k, t));
+        const std::ptrdiff_t node = static_cast<std::ptrdiff_t>(k) * job.node_stride + first + i;
+        p = hn::Add(p, hn::Mul(w, hn::LoadU(d, job.node_phi + node)));
+        q = hn::Add(q, hn::Mul(w, hn::LoadU(d, job.node_a + node)));
+      }
+      hn::Store(p, d, phi + i);
+      hn::Store(q, d, a + i);
+    }
+    for (int c = 0; c < std::min(kBatch, job.cells - first); ++c) {
+      for (int i = 0; i < kCell; i += lanes) {
+        auto p = hn::Zero(d), q = hn::Zero(d);
+        for (int k = 0; k < 4; ++k) {
+          const auto w = hn::Load(d, across.w[k] + i);
+          p = hn::Add(p, hn::Mul(w, hn::Set(d, phi[c + k])));
+          q = hn::Add(q, hn::Mul(w, hn::Set(d, a[c + k])));
+        }
+        const std::ptrdiff_t at = static_cast<std::ptrdiff_t>(first + c) * kCell + i;
+        const auto whole = hn::Min(hn::Max(hn::NearestInt(p), hn::Zero(di)), hn::Set(di, 65534));
+        hn::StoreU(hn::DemoteTo(d16, whole), d16, job.phi + at);
+        hn::StoreU(q, d, job.a + at);
+      }
+    }
+  }
+}
+
 void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int count,
             std::int32_t* base, float* residual) {
   const hn::ScalableTag<float> df;
@@ -735,6 +787,7 @@ HWY_EXPORT(MedianRow);
 HWY_EXPORT(ClaimRow);
 HWY_EXPORT(RejectRow);
 HWY_EXPORT(ConcludeRow);
+HWY_EXPORT(MapCells);
 HWY_EXPORT(MapRow);
 HWY_EXPORT(BoxMeanRow);
 HWY_EXPORT(TargetName);
@@ -776,6 +829,8 @@ void censusBlock(const std::int16_t* grey, int grey_stride, int width, int heigh
   HWY_DYNAMIC_DISPATCH(CensusBlock)
   (grey, grey_stride, width, height, offsets, narrow, out, stride);
 }
+
+void mapCells(const MapCellsJob& job) { HWY_DYNAMIC_DISPATCH(MapCells)(job); }
 
 void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int count,
             std::int32_t* base, float* residual) {

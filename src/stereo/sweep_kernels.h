@@ -87,6 +87,20 @@ void censusBlock(const std::int16_t* grey, int grey_stride, int width, int heigh
                  const CensusOffsets& offsets, bool narrow, std::uint8_t* const out[kPlanes],
                  int stride);
 
+/// A row of pixels between the corners of cells of 16; see ReferenceMap.
+struct MapCellsJob {
+  /// The corner above and to the left of the first cell's own; 32 elements more than there are
+  /// corners must be readable.
+  const float* node_phi = nullptr;
+  const float* node_a = nullptr;
+  int node_stride = 0;
+  int row = 0;  ///< of the cells
+  int cells = 0;
+  std::uint16_t* phi = nullptr;  ///< 16 a cell
+  float* a = nullptr;
+};
+void mapCells(const MapCellsJob& job);
+
 /// Steps of the dither pattern from pixel to pixel and from row to row [1/256].
 inline constexpr int kDitherX = 98, kDitherY = 159;
 

@@ -94,8 +94,8 @@ struct Sample {
 /// What a thread keeps between tiles.
 struct Scratch {
   std::vector<std::int32_t> base;
-  std::vector<float> residual, residual_line, residual_mean, a;
-  std::vector<std::uint16_t> phi;
+  std::vector<float> residual, residual_line, residual_mean;
+  MapView view;
   std::vector<std::int16_t> wide;
   std::vector<std::uint8_t> reference[kPlanes], costs, grey;
   std::vector<std::uint16_t> cost, before, after;
@@ -227,14 +227,18 @@ class SweepMatcher : public SweepPair {
     finest_step_ = std::numeric_limits<float>::max();
     for (const Band& band : level.grid.bands)
       finest_step_ = std::min(finest_step_, static_cast<float>(band.step_h));
-    field_ = level.map.phi.size() - std::count(level.map.phi.begin(), level.map.phi.end(), kNoRay);
+    field_ = level.map.field;
     // phi sin(theta) over the field, a tile at a time.
     float least = 0, most = 0;
-    for (std::size_t i = 0; i < static_cast<std::size_t>(size.area()); i += 7) {
-      if (level.map.phi[i] == kNoRay) continue;
-      const float phi = static_cast<float>(level.map.phi[i] / kPhiUnits - 3.14159265);
-      least = std::min(least, phi);
-      most = std::max(most, phi);
+    MapView view;
+    for (int y = 0; y < size.height; y += 7) {
+      viewMap(level.map, cv::Rect(0, y, size.width, 1), &view);
+      for (int x = 0; x < size.width; ++x) {
+        if (view.phi[x] == kNoRay) continue;
+        const float phi = static_cast<float>(view.phi[x] / kPhiUnits - 3.14159265);
+        least = std::min(least, phi);
+        most = std::max(most, phi);
+      }
     }
     claim_x_ = kClaimScale / finest_step_;
     claim_y_offset_ = std::floor(least * claim_x_) - 4;
@@ -493,7 +497,6 @@ class SweepMatcher : public SweepPair {
   void matchTile(std::size_t l, std::size_t t, Scratch* scratch) {
     Level& level = levels_[l];
     const Tile& tile = level.layout.tiles[t];
-    const ReferenceMap& map = level.map;
     const cv::Rect& rect = tile.rect;
     if (tile.band < 0) {
       level.h(rect).setTo(kNaN);
@@ -513,37 +516,18 @@ class SweepMatcher : public SweepPair {
     map_job.origin = band.origin.data();
     map_job.cells = level.grid.cells;
     map_job.to_column = static_cast<float>(level.grid.column_scale / band.step_h);
-    const int x0 = rect.x - kRadius;
-    const bool whole = x0 >= 0 && x0 + width <= map.size.width;
-    scratch->phi.resize(stride + 64);
-    scratch->a.resize(stride + 64);
     guessTile(l, tile, band, scratch);
-    // Epipolar coordinates of a row of the tile with its halo, from column `from` on.
+    const MapView& view = scratch->view;
+    viewMap(level.map,
+            rect + cv::Size(2 * kViewHalo, 2 * kViewHalo) - cv::Point(kViewHalo, kViewHalo),
+            &scratch->view);
+    // Cells of a row of the tile with its halo, from column `from` on.
     const auto mapTile = [&](const Guess& guess, int y, int from, int count) {
-      const int v = std::clamp(rect.y + y - kRadius, 0, map.size.height - 1);
-      const std::uint16_t* phi = &map.phi[static_cast<std::size_t>(v) * map.size.width];
-      const float* a = &map.a[static_cast<std::size_t>(v) * map.size.width];
-      if (whole) {
-        phi += x0 + from;
-        a += x0 + from;
-        const std::ptrdiff_t ahead = 4 * static_cast<std::ptrdiff_t>(map.size.width);
-        if (v + 4 < map.size.height) {
-          for (int x = 0; x < count; x += 16) hwy::Prefetch(a + ahead + x);
-          for (int x = 0; x < count; x += 32) hwy::Prefetch(phi + ahead + x);
-        }
-      } else {
-        for (int x = 0; x < count; ++x) {
-          const int u = std::clamp(x0 + from + x, 0, map.size.width - 1);
-          scratch->phi[x] = phi[u];
-          scratch->a[x] = a[u];
-        }
-        phi = scratch->phi.data();
-        a = scratch->a.data();
-      }
+      const std::size_t at = view.at(rect.x - kRadius + from, rect.y - kRadius + y);
       map_job.guess_x = guess.x;
       map_job.guess = guess(static_cast<float>(from - kRadius), static_cast<float>(y - kRadius));
       map_job.dither_phase = y * kDitherY;
-      mapRow(map_job, phi, a, count, &scratch->base[y * stride + from],
+      mapRow(map_job, &view.phi[at], &view.a[at], count, &scratch->base[y * stride + from],
              &scratch->residual[y * stride + from]);
     };
     describeTile(l, tile, band, stride, scratch);
@@ -621,6 +605,7 @@ class SweepMatcher : public SweepPair {
   void describeTile(std::size_t l, const Tile& tile, const Band& band, int stride,
                     Scratch* scratch) const {
     const Level& level = levels_[l];
+    const MapView& view = scratch->view;
     const cv::Rect& rect = tile.rect;
     const int width = rect.width + 2 * kRadius, height = rect.height + 2 * kRadius;
     for (auto& plane : scratch->reference)
@@ -643,9 +628,8 @@ class SweepMatcher : public SweepPair {
                                      std::pair(2, h - 3), std::pair(w - 3, h - 3)}) {
           const int u = std::clamp(u0 + du, 0, level.map.size.width - 1);
           const int v = std::clamp(v0 + dv, 0, level.map.size.height - 1);
-          if (level.map.phi[static_cast<std::size_t>(v) * level.map.size.width + u] == kNoRay)
-            continue;
-          if (localFrame(level.map, u, v, &d_phi, &d_a)) {
+          if (view.phi[view.at(u, v)] == kNoRay) continue;
+          if (localFrame(view, u, v, &d_phi, &d_a)) {
             found = true;
             break;
           }
@@ -706,15 +690,14 @@ class SweepMatcher : public SweepPair {
       boxMeanRow(&scratch->residual[corner], stride, where.width, scratch->residual_line.data(),
                  scratch->residual_mean.data());
       const std::size_t i = static_cast<std::size_t>(y) * where.width;
-      const std::size_t pixel =
-          static_cast<std::size_t>(where.y + y) * level.map.size.width + where.x;
+      const std::size_t pixel = scratch->view.at(where.x, where.y + y);
       job.cost = &scratch->cost[i];
       job.index = &scratch->index[i];
       job.before = &scratch->before[i];
       job.after = &scratch->after[i];
       job.base = &scratch->base[corner + kRadius * stride + kRadius];
-      job.phi = &level.map.phi[pixel];
-      job.a = &level.map.a[pixel];
+      job.phi = &scratch->view.phi[pixel];
+      job.a = &scratch->view.a[pixel];
       job.guess = guess(static_cast<float>(guess.where.x), static_cast<float>(guess.where.y + y));
       std::uint16_t* best =
           &scratch->best_cost[static_cast<std::size_t>(guess.where.y + y) * tile.rect.width +
@@ -892,6 +875,7 @@ class SweepMatcher : public SweepPair {
     std::vector<TriangulateJob> points(strips);
     forRows([&](std::size_t s, int begin, int end) {
       TriangulateJob& job = points[s];
+      MapView& view = scratch_->local().view;
       job.count = width;
       job.baseline = static_cast<float>(frame_.baseline);
       job.step_h = finest_step_;
@@ -900,7 +884,8 @@ class SweepMatcher : public SweepPair {
                                              : std::numeric_limits<float>::max();
       job.full_cost = kWorstShare * kFullCost;
       for (int y = begin; y < end; ++y) {
-        job.a = &level.map.a[static_cast<std::size_t>(y) * width];
+        viewMap(level.map, cv::Rect(0, y, width, 1), &view);
+        job.a = view.a.data();
         job.h = smooth.ptr<float>(y);
         job.cost = cost_.ptr<std::uint16_t>(y);
         job.steep = steep_.ptr<std::uint16_t>(y);

@@ -28,7 +28,7 @@ LensPtr wideLens(cv::Size size, double half_field) {
 }
 
 TEST(SweepGeometry, InterpolatedMapIsTheLens) {
-  const cv::Size size(260, 200);
+  const cv::Size size(520, 400);
   for (const double half : {1.2, 1.9}) {
     for (const Eigen::Vector3d& t :
          {Eigen::Vector3d(0.2, 0, 0), Eigen::Vector3d(0.02, -0.01, 0.3)}) {
@@ -38,32 +38,40 @@ TEST(SweepGeometry, InterpolatedMapIsTheLens) {
         EXPECT_NEAR((frame.basis * frame.basis.transpose() - Eigen::Matrix3d::Identity()).norm(), 0,
                     1e-12);
         const ReferenceMap map = makeReferenceMap(widen(lens), size, 0, frame, axis, cv::Mat(), 2);
+        MapView view;
+        viewMap(map, cv::Rect(-3, -2, size.width + 5, size.height + 7), &view);
+        EXPECT_EQ(view.phi[view.at(-3, 50)], view.phi[view.at(0, 50)]);
+        EXPECT_EQ(view.a[view.at(70, size.height + 4)], view.a[view.at(70, size.height - 1)]);
+        EXPECT_GT(std::count(map.exact.begin(), map.exact.end(), ReferenceMap::kInterpolated), 100);
+        std::size_t field = 0;
         int checked = 0;
         for (int y = 0; y < size.height; ++y) {
           for (int x = 0; x < size.width; ++x) {
-            const std::size_t i = static_cast<std::size_t>(y) * size.width + x;
+            const std::size_t i = view.at(x, y);
+            field += view.phi[i] != kNoRay;
             const auto ray = lens->unproject(Eigen::Vector2d(x, y));
             if (!ray) {
-              EXPECT_EQ(map.phi[i], kNoRay);
+              EXPECT_EQ(view.phi[i], kNoRay);
               continue;
             }
             const Eigen::Vector3d b = frame.basis * *ray;
             const double radius = std::hypot(b.y(), b.z());
             if (radius < 0.03) continue;
-            if (map.phi[i] == kNoRay) {
+            if (view.phi[i] == kNoRay) {
               // Only at the very rim may rounding leave a pixel out.
               EXPECT_GT(std::acos(ray->z()), half - 1e-4);
               continue;
             }
             ++checked;
             const double theta = std::atan2(radius, b.x());
-            ASSERT_NEAR(thetaOf(axis, map.a[i]), theta, 1e-4) << x << " " << y;
-            double turn = map.phi[i] / kPhiUnits - M_PI - std::atan2(b.z(), b.y());
+            ASSERT_NEAR(thetaOf(axis, view.a[i]), theta, 1e-4) << x << " " << y;
+            double turn = view.phi[i] / kPhiUnits - M_PI - std::atan2(b.z(), b.y());
             turn -= 2 * M_PI * std::round(turn / (2 * M_PI));
             ASSERT_NEAR(turn, 0, 2e-4 / radius) << x << " " << y;
           }
         }
-        EXPECT_GT(checked, 30000);
+        EXPECT_GT(checked, 120000);
+        EXPECT_EQ(field, map.field);
       }
     }
   }
