@@ -3,6 +3,7 @@
 
 #include "omnister/device/aravis_camera.h"
 #include "omnister/device/replay_camera.h"
+#include "omnister/device/v4l2_camera.h"
 
 namespace omnister::device {
 
@@ -19,10 +20,12 @@ std::unique_ptr<Camera> openCamera(const std::string& device, const CameraSettin
     return makeReplayCamera(readRecording(*path), settings);
   }
   if (const auto which = rest("aravis")) return openAravisCamera(*which, settings);
-  throw InputError("device", "",
-                   "is \"" + printable(device) +
-                       "\", expected aravis:SERIAL (GigE or USB3 Vision) or replay:DIR (recorded "
-                       "images)");
+  if (const auto which = rest("v4l2")) return openV4l2Camera(*which, settings);
+  throw InputError(
+      "device", "",
+      "is \"" + printable(device) +
+          "\", expected aravis:SERIAL (GigE or USB3 Vision), v4l2:/dev/… or replay:DIR (recorded "
+          "images)");
 }
 
 }  // namespace omnister::device

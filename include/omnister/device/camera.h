@@ -147,7 +147,8 @@ class Camera {
   virtual std::optional<std::filesystem::path> lensFile() const { return std::nullopt; }
 };
 
-/// @param device `aravis:WHICH` (see aravis_camera.h), `replay:PATH` (see replay_camera.h)
+/// @param device `aravis:WHICH` (see aravis_camera.h), `v4l2:WHICH` (see v4l2_camera.h),
+/// `replay:PATH` (see replay_camera.h)
 /// @throws CameraError; InputError for a text that names no backend or a broken recording
 std::unique_ptr<Camera> openCamera(const std::string& device, const CameraSettings& settings = {});
 
