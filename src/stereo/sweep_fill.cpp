@@ -99,7 +99,7 @@ float coarseAt(const cv::Mat& h, float near, int scale, int x, int y) {
 /// Spots of the displaced image, by what was matched with them.
 class Spots {
  public:
-  Spots(const ReferenceMap& map, float step) : map_(map), per_radian_(1 / (2 * step)) {
+  Spots(const MapView& map, float step) : map_(map), per_radian_(1 / (2 * step)) {
     width_ = static_cast<int>(kPi * per_radian_) + 3;
     height_ = static_cast<int>(2 * kPi * per_radian_) + 3;
     seen_.assign(static_cast<std::size_t>(width_) * height_, kNaN);
@@ -116,7 +116,7 @@ class Spots {
 
  private:
   std::size_t at(int x, int y, float h) const {
-    const std::size_t i = static_cast<std::size_t>(y) * map_.size.width + x;
+    const std::size_t i = map_.at(x, y);
     const float phi = static_cast<float>(map_.phi[i]) / static_cast<float>(kPhiUnits) - kPi;
     const float theta = map_.a[i] + h;
     const int column = std::clamp(static_cast<int>(theta * per_radian_), 0, width_ - 1);
@@ -124,7 +124,7 @@ class Spots {
         std::clamp(static_cast<int>((phi * std::sin(theta) + kPi) * per_radian_), 0, height_ - 1);
     return static_cast<std::size_t>(row) * width_ + column;
   }
-  const ReferenceMap& map_;
+  const MapView& map_;
   float per_radian_;
   int width_ = 0, height_ = 0;
   std::vector<float> seen_;
@@ -137,17 +137,16 @@ WeakFill::WeakFill(const StereoGeometry& geometry, int threads)
 WeakFill::~WeakFill() = default;
 
 std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
-  const ReferenceMap& map = *job.map;
-  const int width = map.size.width, height = map.size.height;
-  const auto hasRay = [&](int x, int y) {
-    return map.phi[static_cast<std::size_t>(y) * width + x] != kNoRay;
-  };
+  const int width = job.map->size.width, height = job.map->size.height;
+  MapView map, half;
+  const auto hasRay = [&](int x, int y) { return map.phi[map.at(x, y)] != kNoRay; };
   sigma->release();
   if (job.coarse.empty()) return 0;
   // A look at every sixteenth pixel tells whether there is anything to do.
   std::size_t field = 0, open = 0;
   for (int y = 2; y < height; y += 4) {
     const float* line = h->ptr<float>(y);
+    viewMap(*job.map, cv::Rect(0, y, width, 1), &map);
     for (int x = 2; x < width; x += 4) {
       if (!hasRay(x, y)) continue;
       ++field;
@@ -172,7 +171,8 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
     removeSpeckles(&surfaces.back(), near, kCoherent, threads_);
     averageSurface(&surfaces.back(), near, threads_);
   }
-  const ReferenceMap& half = *job.half;
+  viewMap(*job.map, cv::Rect(0, 0, width, height), &map);
+  viewMap(*job.half, cv::Rect(cv::Point(), job.half->size), &half);
   const float b = job.baseline;
   cv::Mat inverse(half.size, CV_32FC1), weight(half.size, CV_32FC1, cv::Scalar(0));
   const cv::Mat support(half.size, CV_8UC1, cv::Scalar(1));
@@ -182,7 +182,7 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
         const int y = static_cast<int>(row);
         float* to = inverse.ptr<float>(y);
         for (int x = 0; x < half.size.width; ++x) {
-          const std::size_t i = row * half.size.width + x;
+          const std::size_t i = half.at(x, y);
           to[x] = kNaN;
           if (half.phi[i] == kNoRay) continue;
           for (std::size_t l = 0; l < surfaces.size(); ++l) {
@@ -206,7 +206,7 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
         float* s = weight.ptr<float>(y);
         for (int x = 0; x < half.size.width; ++x) {
           if (std::isnan(w[x])) continue;
-          const float a = half.a[row * half.size.width + x];
+          const float a = half.a[half.at(x, y)];
           const auto hypothesis = [&](float at) {
             return std::atan2(b * at * std::sin(a), 1 - b * at * std::cos(a));
           };
