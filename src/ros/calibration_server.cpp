@@ -6,10 +6,12 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <cstdio>
 #include <limits>
 
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
+#include "omnister/common/numbers.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
@@ -23,6 +25,7 @@ namespace fs = std::filesystem;
 constexpr double kStageTimeout = 5.0;   // [s] for the stage's action to appear
 constexpr double kMoveTimeout = 120.0;  // [s] for one move
 constexpr std::size_t kMostPositions = 1000;
+constexpr double kResidualMagnification = 100.0;
 
 bool knownModel(const std::string& model) {
   const std::vector<std::string>& names = lensModelNames();
@@ -59,6 +62,15 @@ CalibrationParameters loadCalibrationParameters(Parameters& parameters) {
   result.views = parameters.integer("views", result.views, 3, 1000);
   result.timeout = parameters.number("timeout", result.timeout, 1.0, 86400.0, "s");
   result.dwell = parameters.number("dwell", result.dwell, 0.0, 600.0, "s");
+  for (const std::string& text : parameters.texts("positions")) {
+    const auto numbers = parseNumbers(text);
+    if (!numbers || numbers->size() > kMostPositions ||
+        !std::all_of(numbers->begin(), numbers->end(), [](double x) { return std::isfinite(x); }))
+      throw InputError("~positions", "",
+                       "is '" + printable(text) + "', expected finite numbers \"0.0 0.1 …\" [m]");
+    result.positions.insert(result.positions.end(), numbers->begin(), numbers->end());
+  }
+  result.start = parameters.flag("start", result.start);
   result.collector.min_move = parameters.number("min_move", result.collector.min_move, 0.0, 1.0);
   result.collector.still_px =
       parameters.number("still_px", result.collector.still_px, 0.01, 1e4, "px");
@@ -78,6 +90,8 @@ CalibrationServer::CalibrationServer(const ros::NodeHandle& node,
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
   // Latched: the last picture stays to be seen.
   coverage_publisher_ = node_.advertise<sensor_msgs::Image>("coverage", 1, true);
+  residuals_publisher_ = node_.advertise<sensor_msgs::Image>("residuals", 1, true);
+  goal_publisher_ = node_.advertise<CalibrateActionGoal>("calibrate/goal", 1);
   mover_ = std::make_unique<Mover>(node_, "move_stage", true);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("calibration", this, &CalibrationServer::diagnose);
@@ -88,10 +102,75 @@ CalibrationServer::CalibrationServer(const ros::NodeHandle& node,
   server_ = std::make_unique<Server>(
       node_, "calibrate", [this](const CalibrateGoalConstPtr& goal) { execute(goal); }, false);
   server_->start();
+  ros::NodeHandle own = private_node;
+  services_ = {own.advertiseService("start", &CalibrationServer::onStart, this),
+               own.advertiseService("save", &CalibrationServer::onSave, this),
+               own.advertiseService("reset", &CalibrationServer::onReset, this)};
+  if (parameters_.start) begin();
+}
+
+void CalibrationServer::begin() {
+  const CalibrateActionGoal goal;
+  goal_publisher_.publish(goal);
+}
+
+bool CalibrationServer::onStart(std_srvs::Trigger::Request& /*request*/,
+                                std_srvs::Trigger::Response& response) {
+  if (server_->isActive()) {
+    response.success = 0;
+    response.message = "it is under way";
+    return true;
+  }
+  begin();
+  response.success = 1;
+  response.message = "collecting views; see the topic " + node_.resolveName("coverage");
+  return true;
+}
+
+bool CalibrationServer::onSave(std_srvs::Trigger::Request& /*request*/,
+                               std_srvs::Trigger::Response& response) {
+  if (server_->isActive()) {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      save_now_ = true;
+    }
+    progress_.notify_all();
+    response.success = 1;
+    response.message = "fitting the views there are: the action's result and the topic " +
+                       node_.resolveName("lens_model") + " tell the outcome";
+    return true;
+  }
+  try {
+    const CalibrateResult result = fitAndCommit(parameters_.model);
+    response.success = 1;
+    response.message = result.lens_file + ": " + result.model + ", RMS " +
+                       formatNumber(result.rms_px) + " px over " +
+                       std::to_string(result.views_used) + " views";
+    std::lock_guard<std::mutex> lock(mutex_);
+    collector_.reset();
+    state_ = "idle";
+  } catch (const std::exception& error) {
+    response.success = 0;
+    response.message = printable(error.what(), 500);
+    std::lock_guard<std::mutex> lock(mutex_);
+    state_ = "idle";
+  }
+  return true;
+}
+
+bool CalibrationServer::onReset(std_srvs::Trigger::Request& /*request*/,
+                                std_srvs::Trigger::Response& response) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  const std::size_t views = collector_ ? collector_->detections().views.size() : 0;
+  collector_.reset();
+  response.success = 1;
+  response.message = std::to_string(views) + " views forgotten";
+  return true;
 }
 
 CalibrationServer::~CalibrationServer() {
   diagnostics_timer_.stop();
+  for (ros::ServiceServer& service : services_) service.shutdown();
   {
     std::lock_guard<std::mutex> lock(mutex_);
     stopping_ = true;
@@ -115,8 +194,10 @@ void CalibrationServer::execute(const CalibrateGoalConstPtr& goal) {
     last_problem_ = message;
     result.views =
         collector_ ? static_cast<std::uint32_t>(collector_->detections().views.size()) : 0;
-    collector_.reset();
     newest_.reset();
+    save_now_ = false;
+    // After a lens nothing of the views is needed; else the next goal goes on with them.
+    if (result.success != 0) collector_.reset();
   };
   try {
     result = calibrateOnce(*goal);
@@ -198,7 +279,7 @@ bool CalibrationServer::waitForViews(std::size_t views, double seconds) {
     feedback("collecting");
     std::unique_lock<std::mutex> lock(mutex_);
     const auto enough = [&] {
-      return collector_ && collector_->detections().views.size() >= views;
+      return save_now_ || (collector_ && collector_->detections().views.size() >= views);
     };
     if (enough()) return true;
     if ((ros::SteadyTime::now() - start).toSec() > seconds) return false;
@@ -222,12 +303,15 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
       goal.views > 0 ? goal.views : static_cast<std::size_t>(parameters_.views);
   const double timeout = goal.timeout > 0.0 ? goal.timeout : parameters_.timeout;
 
+  const std::vector<double> positions =
+      goal.positions.empty() ? parameters_.positions : goal.positions;
+
   {
     std::lock_guard<std::mutex> lock(mutex_);
-    collector_.reset();
     newest_.reset();
     last_problem_.clear();
-    frame_id_.clear();
+    save_now_ = false;
+    views_wanted_ = views;
   }
   image_subscriber_ = transport_.subscribe(
       "image_raw", 1, [this](const sensor_msgs::ImageConstPtr& image) { onImage(image); });
@@ -238,7 +322,7 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
     std::lock_guard<std::mutex> lock(mutex_);
     return collector_ ? collector_->detections().views.size() : 0;
   };
-  for (const double position : goal.positions) {
+  for (const double position : positions) {
     const std::size_t before = collected();
     if (before >= views || left() <= 0.0) break;
     moveTo(position);
@@ -246,42 +330,64 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
   }
   const bool enough = waitForViews(views, left());
   image_subscriber_.shutdown();
+  if (!enough) {
+    std::string message;
+    Detections detections;
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      if (collector_) detections = collector_->detections();
+      const int images = collector_ ? collector_->images() : 0;
+      message = std::to_string(detections.views.size()) + " of " + std::to_string(views) +
+                " views within " + std::to_string(static_cast<int>(timeout)) + " s, from " +
+                std::to_string(images) + " images on " + node_.resolveName("image_raw") +
+                (last_problem_.empty() ? "" : " (" + last_problem_ + ")");
+    }
+    if (!detections.views.empty())
+      message += "; they are kept in " + keepViews(detections).string() +
+                 ": start again to go on, or call ~save to fit them";
+    throw Error(message);
+  }
+  CalibrateResult result = fitAndCommit(model);
+  checkPreempted();
+  return result;
+}
 
+fs::path CalibrationServer::keepViews(const Detections& detections) const {
+  fs::path path = LensStore(parameters_.store).pathOf(parameters_.camera_name);
+  fs::create_directories(path.parent_path());
+  path.replace_filename(parameters_.camera_name + "_detections.csv");
+  writeFileAtomically(path, formatDetections(detections), Previous::kKeep);
+  return path;
+}
+
+CalibrateResult CalibrationServer::fitAndCommit(const std::string& model) {
+  const std::lock_guard<std::mutex> one(fit_mutex_);
   Detections detections;
   std::string frame_id;
   cv::Mat picture;
   {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (!enough) {
-      const std::size_t have = collector_ ? collector_->detections().views.size() : 0;
-      const int images = collector_ ? collector_->images() : 0;
-      throw Error(std::to_string(have) + " of " + std::to_string(views) + " views within " +
-                  std::to_string(static_cast<int>(timeout)) + " s, from " + std::to_string(images) +
-                  " images on " + node_.resolveName("image_raw") +
-                  (last_problem_.empty() ? "" : " (" + last_problem_ + ")"));
-    }
+    if (!collector_ || collector_->detections().views.empty())
+      throw Error("there are no views yet: start first");
     detections = collector_->detections();
     frame_id = frame_id_;
-    picture = collector_->draw();
+    picture = collector_->draw({std::to_string(detections.views.size()) + " views"});
+    state_ = "fitting";
   }
-  publishCoverage(picture, frame_id, ros::Time::now());
-
-  feedback("fitting");
-  const LensStore store(parameters_.store);
+  publishPicture(coverage_publisher_, picture, frame_id, ros::Time::now());
+  if (server_->isActive()) feedback("fitting");
   // The views are worth keeping even if the fit refuses them.
-  fs::path views_path = store.pathOf(parameters_.camera_name);
-  fs::create_directories(views_path.parent_path());
-  views_path.replace_filename(parameters_.camera_name + "_detections.csv");
-  writeFileAtomically(views_path, formatDetections(detections), Previous::kKeep);
+  keepViews(detections);
   CalibrationOptions options;
   options.model = model;
   options.threads = parameters_.detector.threads;
   CalibrationResult fit = calibrate(detections, options);
-  checkPreempted();
-
-  feedback("saving");
+  if (server_->isActive()) {
+    checkPreempted();
+    feedback("saving");
+  }
   fit.file.camera_name = parameters_.camera_name;
-  const fs::path path = store.save(parameters_.camera_name, fit.file);
+  const fs::path path = LensStore(parameters_.store).save(parameters_.camera_name, fit.file);
   publishLens(fit.file, frame_id);
 
   CalibrateResult result;
@@ -296,6 +402,15 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
   result.views_used = static_cast<std::uint32_t>(std::count_if(
       fit.views.begin(), fit.views.end(), [](const ViewResult& view) { return view.used; }));
   result.points = static_cast<std::uint32_t>(fit.points);
+  std::vector<std::vector<Eigen::Vector2d>> residuals;
+  for (const ViewResult& view : fit.views)
+    residuals.push_back(view.used ? view.residuals : std::vector<Eigen::Vector2d>());
+  char summary[120];
+  std::snprintf(summary, sizeof summary, "%s: RMS %.3f px, %u views, residuals x %.0f",
+                result.model.c_str(), result.rms_px, result.views_used, kResidualMagnification);
+  publishPicture(residuals_publisher_,
+                 drawResiduals(detections, residuals, kResidualMagnification, {summary}), frame_id,
+                 ros::Time::now());
   ROS_INFO("calibrated %s: %s, %u views, %u corners, RMS %.3f px", parameters_.camera_name.c_str(),
            result.model.c_str(), result.views_used, result.points, result.rms_px);
   return result;
@@ -346,7 +461,9 @@ void CalibrationServer::look(const sensor_msgs::ImageConstPtr& image) {
   {
     std::lock_guard<std::mutex> lock(mutex_);
     if (state_ == "idle" || state_ == "fitting" || state_ == "saving") return;
-    if (!collector_) collector_.emplace(gray.size(), parameters_.collector);
+    // Views of images of another size cannot go on.
+    if (!collector_ || collector_->detections().image_size != gray.size())
+      collector_.emplace(gray.size(), parameters_.collector);
     frame_id_ = image->header.frame_id;
     switch (collector_->add(gray, found)) {
       case ViewCollector::Verdict::kNotFound:
@@ -362,18 +479,28 @@ void CalibrationServer::look(const sensor_msgs::ImageConstPtr& image) {
         last_problem_.clear();
         break;
     }
-    if (coverage_publisher_.getNumSubscribers() > 0) picture = collector_->draw();
+    if (coverage_publisher_.getNumSubscribers() > 0) picture = collector_->draw(guidance());
   }
   progress_.notify_all();
-  if (!picture.empty()) publishCoverage(picture, image->header.frame_id, image->header.stamp);
+  if (!picture.empty())
+    publishPicture(coverage_publisher_, picture, image->header.frame_id, image->header.stamp);
 }
 
-void CalibrationServer::publishCoverage(const cv::Mat& picture, const std::string& frame_id,
-                                        const ros::Time& stamp) {
+std::vector<std::string> CalibrationServer::guidance() const {
+  char progress[80];
+  std::snprintf(progress, sizeof progress, "%zu of %zu views, %.0f %% covered",
+                collector_->detections().views.size(), views_wanted_,
+                100.0 * collector_->coverage());
+  return {progress, "next: " + collector_->hint(),
+          last_problem_.empty() ? "taken: now hold it elsewhere" : last_problem_};
+}
+
+void CalibrationServer::publishPicture(const ros::Publisher& publisher, const cv::Mat& picture,
+                                       const std::string& frame_id, const ros::Time& stamp) const {
   const sensor_msgs::ImagePtr message = toImage(picture, sensor_msgs::image_encodings::BGR8);
   message->header.frame_id = frame_id;
   message->header.stamp = stamp;
-  coverage_publisher_.publish(message);
+  publisher.publish(message);
 }
 
 void CalibrationServer::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {

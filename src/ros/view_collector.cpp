@@ -32,6 +32,20 @@ double meanMove(const ViewDetections& a, const ViewDetections& b) {
   return sum / static_cast<double>(shared);
 }
 
+/// White on black, from the upper left corner on.
+void write(const std::vector<std::string>& lines, cv::Mat& picture) {
+  const double scale = std::clamp(picture.cols / 1100.0, 0.3, 2.0);
+  const int step = static_cast<int>(std::lround(30.0 * scale));
+  for (std::size_t i = 0; i < lines.size(); ++i) {
+    const cv::Point at(step / 2, step * (static_cast<int>(i) + 1));
+    const int width = std::max(1, static_cast<int>(std::lround(2.0 * scale)));
+    cv::putText(picture, lines[i], at, cv::FONT_HERSHEY_SIMPLEX, scale, cv::Scalar::all(0),
+                3 * width, cv::LINE_AA);
+    cv::putText(picture, lines[i], at, cv::FONT_HERSHEY_SIMPLEX, scale, cv::Scalar::all(255), width,
+                cv::LINE_AA);
+  }
+}
+
 }  // namespace
 
 ViewCollector::ViewCollector(cv::Size image_size, const CollectorOptions& options)
@@ -103,7 +117,7 @@ double ViewCollector::coverage() const {
   return inside == 0 ? 0.0 : static_cast<double>(covered) / inside;
 }
 
-std::string ViewCollector::hint() const {
+int ViewCollector::wanted() const {
   // The emptiest cell, inner rings first: outwards it gets harder to hold the target still.
   int best = -1;
   for (int cell = 0; cell < static_cast<int>(corners_.size()); ++cell) {
@@ -112,6 +126,11 @@ std::string ViewCollector::hint() const {
         corners_[static_cast<std::size_t>(cell)] < corners_[static_cast<std::size_t>(best)])
       best = cell;
   }
+  return best;
+}
+
+std::string ViewCollector::hint() const {
+  const int best = wanted();
   if (best < 0) return "the image is black";
   const int ring = best / options_.sectors;
   const double turn = 2.0 * CV_PI * (best % options_.sectors) / options_.sectors;
@@ -125,8 +144,13 @@ std::string ViewCollector::hint() const {
   return place + ", half way out";
 }
 
-cv::Mat ViewCollector::draw() const {
-  if (last_image_.empty()) return cv::Mat(cells_.size(), CV_8UC3, cv::Scalar::all(0));
+cv::Mat ViewCollector::draw(const std::vector<std::string>& lines) const {
+  if (last_image_.empty()) {
+    cv::Mat nothing(cells_.size(), CV_8UC3, cv::Scalar::all(0));
+    write(lines, nothing);
+    return nothing;
+  }
+  const int next = wanted();
   cv::Mat picture;
   cv::cvtColor(last_image_, picture, cv::COLOR_GRAY2BGR);
   for (int v = 0; v < picture.rows; ++v) {
@@ -141,6 +165,12 @@ cv::Mat ViewCollector::draw() const {
         tint = cv::Vec3b(0, static_cast<std::uint8_t>(std::min(40 + 4 * n, 110)), 0);
       else if (bright(cell[u]))
         tint = cv::Vec3b(0, 0, 60);
+      if (edge && next >= 0 &&
+          (cell[u] == next || (u > 0 && cell[u - 1] == next) ||
+           (v > 0 && cells_.at<int>(v - 1, u) == next))) {
+        row[u] = cv::Vec3b(60, 230, 255);
+        continue;
+      }
       for (int k = 0; k < 3; ++k)
         row[u][k] = cv::saturate_cast<std::uint8_t>((edge ? 40 : 0) + 0.6 * row[u][k] + tint[k]);
     }
@@ -155,6 +185,42 @@ cv::Mat ViewCollector::draw() const {
   if (previous_)
     for (const Eigen::Vector2d& pixel : previous_->pixels)
       cv::circle(picture, at(pixel), 4, cv::Scalar(0, 220, 255), 1, cv::LINE_AA);
+  write(lines, picture);
+  return picture;
+}
+
+cv::Mat drawResiduals(const Detections& detections,
+                      const std::vector<std::vector<Eigen::Vector2d>>& residuals,
+                      double magnification, const std::vector<std::string>& lines) {
+  cv::Mat picture(detections.image_size, CV_8UC3, cv::Scalar::all(30));
+  constexpr int kFractionBits = 4;
+  const auto fixed = [](const Eigen::Vector2d& p) {
+    const auto scaled = [](double x) {
+      return static_cast<int>(std::lround(std::clamp(x, -1e5, 1e5) * (1 << kFractionBits)));
+    };
+    return cv::Point(scaled(p.x()), scaled(p.y()));
+  };
+  for (std::size_t i = 0; i < detections.views.size(); ++i) {
+    const ViewDetections& view = detections.views[i];
+    for (std::size_t k = 0; k < view.pixels.size(); ++k) {
+      const Eigen::Vector2d& pixel = view.pixels[k];
+      if (i >= residuals.size() || k >= residuals[i].size()) {
+        const Eigen::Vector2d arm(3.0, 3.0);
+        cv::line(picture, fixed(pixel - arm), fixed(pixel + arm), cv::Scalar::all(120), 1,
+                 cv::LINE_AA, kFractionBits);
+        continue;
+      }
+      const Eigen::Vector2d& residual = residuals[i][k];
+      const double size = residual.norm();
+      const cv::Scalar colour = size < 0.5   ? cv::Scalar(90, 230, 90)
+                                : size < 1.0 ? cv::Scalar(60, 220, 255)
+                                             : cv::Scalar(80, 80, 255);
+      cv::circle(picture, fixed(pixel), 1 << kFractionBits, colour, -1, cv::LINE_AA, kFractionBits);
+      cv::line(picture, fixed(pixel), fixed(pixel + magnification * residual), colour, 1,
+               cv::LINE_AA, kFractionBits);
+    }
+  }
+  write(lines, picture);
   return picture;
 }
 

@@ -2,11 +2,13 @@
 #include <actionlib/client/simple_action_client.h>
 #include <gmock/gmock.h>
 #include <std_srvs/SetBool.h>
+#include <std_srvs/Trigger.h>
 #include <unistd.h>
 
 #include <atomic>
 #include <cmath>
 #include <filesystem>
+#include <functional>
 
 #include "omnister/common/file_io.h"
 #include "omnister/ros/calibration_server.h"
@@ -57,40 +59,76 @@ TEST_F(Calibration, FitsTheLensOfTheSimulatedCameraAndTellsEverybody) {
   const SimRig rig(node_, ros::NodeHandle("~rig"), parameters);
   const CalibrationServer calibration(camera_node_, private_node_);
   Collector<LensModelMessage> lenses(camera_node_, "lens_model");
+  Collector<sensor_msgs::Image> residuals(camera_node_, "residuals");
   Client client(camera_node_, "calibrate", false);
   ASSERT_TRUE(client.waitForServer(ros::Duration(20.0)));
 
-  CalibrateGoal goal;
-  goal.views = 8;
-  goal.model = "asphere";
-  goal.timeout = 120.0;
+  // Whoever holds the board: it rests until a view of it is taken, and never longer than three
+  // seconds.
   ros::ServiceClient show = ros::NodeHandle("~rig").serviceClient<std_srvs::SetBool>("show_board");
   std::atomic<int> views{0};
   double coverage = 0.0;
-  client.sendGoal(goal, {}, {}, [&](const CalibrateFeedbackConstPtr& feedback) {
-    views = static_cast<int>(feedback->views);
-    coverage = feedback->coverage;
-  });
-  // The board rests until a view of it is taken, and never longer than three seconds.
   int shown_for = -1;
   ros::WallTime since;
-  const bool done = eventually(
-      [&] {
-        if (views > shown_for || (ros::WallTime::now() - since).toSec() > 3.0) {
-          shown_for = views;
-          since = ros::WallTime::now();
-          std_srvs::SetBool request;
-          request.request.data = 1;
-          show.call(request);
-        }
-        return client.getState().isDone();
-      },
-      150.0);
-  ASSERT_TRUE(done);
+  const auto hold = [&](const std::function<bool()>& until) {
+    return eventually(
+        [&] {
+          if (views > shown_for || (ros::WallTime::now() - since).toSec() > 3.0) {
+            shown_for = views;
+            since = ros::WallTime::now();
+            std_srvs::SetBool request;
+            request.request.data = 1;
+            show.call(request);
+          }
+          return until();
+        },
+        150.0);
+  };
+  const auto send = [&](double timeout) {
+    CalibrateGoal goal;
+    goal.views = 1000;
+    goal.model = "asphere";
+    goal.timeout = timeout;
+    client.sendGoal(goal, {}, {}, [&](const CalibrateFeedbackConstPtr& feedback) {
+      views = static_cast<int>(feedback->views);
+      coverage = feedback->coverage;
+    });
+  };
+  const auto call = [&](const std::string& name) {
+    std_srvs::Trigger trigger;
+    EXPECT_TRUE(ros::service::call(private_node_.resolveName(name), trigger));
+    return trigger.response;
+  };
+  EXPECT_FALSE(call("save").success) << "there is nothing to save yet";
+
+  // Views outlive a goal that is cancelled, and one that runs out of time.
+  send(120.0);
+  ASSERT_TRUE(hold([&] { return views >= 3; }));
+  client.cancelGoal();
+  ASSERT_TRUE(client.waitForResult(ros::Duration(60.0)));
+  EXPECT_EQ(client.getState(), State::PREEMPTED);
+  const int before = static_cast<int>(client.getResult()->views);
+  EXPECT_GE(before, 3);
+  send(0.05);
+  ASSERT_TRUE(client.waitForResult(ros::Duration(60.0)));
+  EXPECT_EQ(client.getState(), State::ABORTED);
+  EXPECT_GE(static_cast<int>(client.getResult()->views), before);
+  EXPECT_THAT(client.getResult()->message, testing::HasSubstr("are kept in"));
+  EXPECT_TRUE(std::filesystem::exists(store_ / "wide_detections.csv"));
+  EXPECT_FALSE(std::filesystem::exists(store_ / "wide.yaml"));
+
+  // The next one goes on with them, until somebody says that they will do.
+  send(120.0);
+  ASSERT_TRUE(hold([&] { return views >= 8; }));
+  EXPECT_TRUE(call("save").success);
+  ASSERT_TRUE(client.waitForResult(ros::Duration(120.0)));
   const CalibrateResultConstPtr result = client.getResult();
   ASSERT_EQ(client.getState(), State::SUCCEEDED) << result->message;
   EXPECT_TRUE(result->success);
-  EXPECT_EQ(result->views, 8u);
+  EXPECT_GE(result->views, 8u);
+  EXPECT_FALSE(call("save").success) << "after a lens its views are done with";
+  ASSERT_TRUE(eventually([&] { return residuals.size() > 0; }));
+  EXPECT_EQ(residuals.last()->encoding, "bgr8");
   EXPECT_GT(coverage, 0.2);
   EXPECT_LT(result->rms_px, 0.15);
 
@@ -127,6 +165,32 @@ TEST_F(Calibration, SaysWhyThereAreNoViews) {
   EXPECT_FALSE(client.getResult()->success);
   EXPECT_THAT(client.getResult()->message, testing::HasSubstr("0 of 25 views within"));
   EXPECT_FALSE(std::filesystem::exists(store_ / "wide.yaml"));
+}
+
+TEST_F(Calibration, BeginsByServiceOrByItself) {
+  ros::Publisher images = camera_node_.advertise<sensor_msgs::Image>("image_raw", 1);
+  {
+    const CalibrationServer calibration(camera_node_, private_node_);
+    EXPECT_EQ(images.getNumSubscribers(), 0u);
+    std_srvs::Trigger trigger;
+    ASSERT_TRUE(ros::service::call(private_node_.resolveName("start"), trigger));
+    EXPECT_TRUE(trigger.response.success);
+    EXPECT_TRUE(eventually([&] { return images.getNumSubscribers() == 1; }));
+    EXPECT_TRUE(eventually([&] {
+      std_srvs::Trigger again;
+      ros::service::call(private_node_.resolveName("start"), again);
+      return again.response.success == 0;
+    })) << "it is under way";
+    ASSERT_TRUE(ros::service::call(private_node_.resolveName("reset"), trigger));
+    EXPECT_TRUE(trigger.response.success);
+  }
+  EXPECT_TRUE(eventually([&] { return images.getNumSubscribers() == 0; }));
+  ros::NodeHandle own("~by_itself");
+  own.setParam("target", kSource + "/config/demo/target.yaml");
+  own.setParam("store", store_.string());
+  own.setParam("start", true);
+  const CalibrationServer calibration(camera_node_, own);
+  EXPECT_TRUE(eventually([&] { return images.getNumSubscribers() == 1; }));
 }
 
 TEST_F(Calibration, CancelsAtOnceAndListensOnlyWhileItRuns) {
@@ -189,6 +253,7 @@ TEST_F(Calibration, RefusesGoalsAndParametersByName) {
   EXPECT_THAT(refusal("target", "/none.yaml"), testing::HasSubstr("/none.yaml"));
   EXPECT_THAT(refusal("model", "magic"), testing::HasSubstr("magic"));
   EXPECT_THAT(refusal("views", "1"), testing::HasSubstr("views"));
+  EXPECT_THAT(refusal("positions", "0.1 here"), testing::HasSubstr("positions"));
 }
 
 }  // namespace

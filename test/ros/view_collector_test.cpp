@@ -96,6 +96,42 @@ TEST(ViewCollector, DrawsCoveredCellsGreenAndGapsRed) {
   EXPECT_GT(gap[2], gap[1]);
 }
 
+TEST(ViewCollector, WritesWhatToDoAndOutlinesTheCellThatIsWanted) {
+  ViewCollector collector({kWidth, kHeight}, {});
+  EXPECT_GT(cv::countNonZero(collector.draw({"hold it still"}).reshape(1)), 100)
+      << "before any image";
+  const cv::Mat image(kHeight, kWidth, CV_8UC1, cv::Scalar(100));
+  collector.add(image, gridAt(150, 240));
+  collector.add(image, gridAt(150, 240));
+  cv::Mat outlined;
+  cv::inRange(collector.draw(), cv::Scalar(60, 230, 255), cv::Scalar(60, 230, 255), outlined);
+  EXPECT_GT(cv::countNonZero(outlined), 50);
+  EXPECT_LT(cv::countNonZero(outlined), kWidth * kHeight / 20);
+  const cv::Mat plain = collector.draw();
+  const cv::Mat told = collector.draw({"one", "two"});
+  const cv::Rect corner(0, 0, kWidth / 3, kHeight / 5);
+  EXPECT_GT(cv::norm(plain(corner), told(corner), cv::NORM_INF), 100.0);
+  const cv::Rect rest(kWidth / 2, kHeight / 2, kWidth / 2, kHeight / 2);
+  EXPECT_EQ(cv::norm(plain(rest), told(rest), cv::NORM_INF), 0.0);
+}
+
+TEST(DrawResiduals, MagnifiesEachAndCrossesOutWhatWasNotUsed) {
+  Detections detections;
+  detections.image_size = {200, 100};
+  ViewDetections view;
+  view.pixels = {{50.0, 50.0}};
+  view.points = {{0.0, 0.0, 0.0}};
+  detections.views = {view, view};
+  detections.views[1].pixels = {{150.0, 50.0}};
+  const cv::Mat picture = drawResiduals(detections, {{{0.3, 0.0}}, {}}, 100.0);
+  ASSERT_EQ(picture.size(), cv::Size(200, 100));
+  // 0.3 px to the right, a hundred times: green as far as pixel 80.
+  EXPECT_GT(picture.at<cv::Vec3b>(50, 78)[1], 150);
+  EXPECT_LT(picture.at<cv::Vec3b>(50, 90)[1], 60);
+  EXPECT_EQ(picture.at<cv::Vec3b>(50, 150)[1], picture.at<cv::Vec3b>(50, 150)[2]) << "grey";
+  EXPECT_GT(picture.at<cv::Vec3b>(50, 150)[1], 60);
+}
+
 TEST(ViewCollector, RefusesImagesOfAnotherSize) {
   ViewCollector collector({kWidth, kHeight}, {});
   EXPECT_THROW(collector.add(cv::Mat(10, 10, CV_8UC1), std::nullopt), Error);

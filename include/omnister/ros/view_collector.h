@@ -40,12 +40,15 @@ class ViewCollector {
   /// Where to hold the target next, for a person, e.g. "lower left, at the edge".
   std::string hint() const;
 
-  /// The last image dimmed, covered cells tinted green, gaps red, all corners kept as dots, those
-  /// of the last image as circles. CV_8UC3.
-  cv::Mat draw() const;
+  /// The last image dimmed, covered cells tinted green, gaps red, the cell of hint() outlined, all
+  /// corners kept as dots, those of the last image as circles. CV_8UC3.
+  /// @param lines written into the upper left corner
+  cv::Mat draw(const std::vector<std::string>& lines = {}) const;
 
  private:
   int cellOf(double u, double v) const;
+  /// The emptiest cell; -1 while the image is black.
+  int wanted() const;
   bool bright(int cell) const { return brightness_[static_cast<std::size_t>(cell)] > 12.0; }
 
   CollectorOptions options_;
@@ -57,5 +60,13 @@ class ViewCollector {
   cv::Mat last_image_;
   int images_ = 0;
 };
+
+/// How far the fit is from each corner that was seen: lines of `magnification` times the residual,
+/// green below half a pixel, yellow below one, else red.
+/// @param residuals observed less predicted [px], of each corner of each view; views without any
+/// are crossed out in grey
+cv::Mat drawResiduals(const Detections& detections,
+                      const std::vector<std::vector<Eigen::Vector2d>>& residuals,
+                      double magnification, const std::vector<std::string>& lines = {});
 
 }  // namespace omnister

@@ -1,0 +1,78 @@
+#!/usr/bin/env bash
+# Makes the pictures of the documents anew: ./run exec docs/pictures/make.sh
+# Nothing but the package's own simulated rig and room stands in them.
+set -euo pipefail
+out=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P)
+work=$(mktemp -d)
+pids=()
+finish() {
+  for pid in "${pids[@]}"; do kill -INT "$pid" 2>/dev/null || true; done
+  wait
+  rm -rf "$work"
+}
+trap finish EXIT
+
+export ROS_HOME=$work/ros ROS_LOG_DIR=$work/log QT_QPA_PLATFORM=xcb LIBGL_ALWAYS_SOFTWARE=1
+export XDG_RUNTIME_DIR=$work/runtime
+mkdir -m 700 "$XDG_RUNTIME_DIR"
+port=$(/usr/bin/python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
+export ROS_MASTER_URI=http://localhost:$port
+Xvfb -displayfd 4 -screen 0 1280x1024x24 -nolisten tcp 4>"$work/display" 2>/dev/null &
+pids+=($!)
+until [ -s "$work/display" ]; do sleep 0.1; done
+DISPLAY=:$(cat "$work/display")
+export DISPLAY
+
+share=$(rospack find omnister)
+cat >"$work/pictures.launch" <<XML
+<launch>
+  <node name="rig" pkg="omnister" type="sim_rig_node">
+    <param name="scene" value="$share/config/scenes/room.yaml"/>
+    <param name="lens" value="$share/config/demo/lens.yaml"/>
+    <param name="travel" value="0.4"/>
+    <param name="max_speed" value="0.3"/>
+    <param name="homed" value="true"/>
+    <param name="camera/frame_rate" value="2"/>
+    <param name="stage/speed_mps" value="0.2"/>
+  </node>
+  <include file="$share/launch/stereo.launch">
+    <arg name="lens" value="$share/config/demo/lens.yaml"/>
+    <arg name="min_baseline" value="0.15"/>
+    <arg name="max_baseline" value="0.25"/>
+    <arg name="max_range" value="12"/>
+    <arg name="max_rate" value="0.7"/>
+  </include>
+  <include file="$share/launch/rviz.launch"><arg name="max_m" value="0.4"/></include>
+</launch>
+XML
+roslaunch -p "$port" "$work/pictures.launch" >"$work/roslaunch.log" 2>&1 &
+pids+=($!)
+cat >"$work/take.py" <<'PY'
+import sys
+import numpy
+import rospy
+from omnister.msg import MoveStageActionGoal, MoveStageActionResult, MoveStageGoal
+from sensor_msgs.msg import Image, PointCloud2
+
+rospy.init_node('pictures')
+rospy.wait_for_message('/camera/image_raw', Image, 120)
+goals = rospy.Publisher('/stage/move_stage/goal', MoveStageActionGoal, queue_size=1)
+while goals.get_num_connections() == 0:
+    rospy.sleep(0.1)
+for position in (0.1, 0.3):
+    goals.publish(MoveStageActionGoal(goal=MoveStageGoal(position=position)))
+    rospy.wait_for_message('/stage/move_stage/result', MoveStageActionResult, 60)
+    rospy.sleep(3.0)
+rospy.wait_for_message('/camera/points2', PointCloud2, 120)
+image = rospy.wait_for_message('/camera/epipolar', Image, 120)
+pixels = numpy.frombuffer(image.data, numpy.uint8).reshape(image.height, image.width, 3)[:, :, ::-1]
+with open(sys.argv[1], 'wb') as file:
+    file.write(b'P6 %d %d 255\n' % (image.width, image.height) + pixels.tobytes())
+rospy.sleep(6.0)  # for rviz to draw
+PY
+/usr/bin/python3 "$work/take.py" "$work/epipolar.ppm"
+import -window root "$work/rviz.png"
+small=(-strip -dither FloydSteinberg -colors 96 -define png:compression-level=9)
+convert "$work/rviz.png" -crop 900x700+365+110 +repage -resize 720x "${small[@]}" "$out/cloud.png"
+convert "$work/epipolar.ppm" -crop 100%x84%+0+60 +repage -resize 900x "${small[@]}" "$out/epipolar.png"
+ls -l "$out"/*.png
