@@ -175,21 +175,27 @@ JointRefinement::JointRefinement(const StereoGeometry& geometry, int threads, in
       scale_(scale),
       prior_px_(prior_px),
       rays_(*geometry.reference_lens, geometry.reference_size, threads) {
-  std::vector<const LensModel*> lenses;
-  std::vector<cv::Size> sizes;
-  for (const auto& displaced : geometry.displaced) {
+  setDisplaced(geometry.displaced);
+}
+
+void JointRefinement::setDisplaced(const std::vector<StereoGeometry::Displaced>& displaced) {
+  geometry_.displaced = displaced;
+  table_of_.clear();
+  widest_ = 0;
+  for (const auto& camera : displaced) {
     std::size_t i = 0;
-    while (i < lenses.size() && (lenses[i] != displaced.lens.get() || sizes[i] != displaced.size))
+    while (i < tables_.size() &&
+           (tables_[i].lens != camera.lens || tables_[i].size != camera.size)) {
       ++i;
-    if (i == lenses.size()) {
-      lenses.push_back(displaced.lens.get());
-      sizes.push_back(displaced.size);
-      tables_.emplace_back(sweep::widen(displaced.lens), displaced.size, threads);
+    }
+    if (i == tables_.size()) {
+      tables_.push_back({camera.lens, camera.size,
+                         ProjectionTable(sweep::widen(camera.lens), camera.size, threads_)});
     }
     table_of_.push_back(i);
     widest_ =
-        std::max(widest_, static_cast<float>(tables_[i].focalPx() *
-                                             displaced.T_ref_disp.translation().norm() / scale_));
+        std::max(widest_, static_cast<float>(tables_[i].table.focalPx() *
+                                             camera.T_ref_disp.translation().norm() / scale_));
   }
 }
 
@@ -218,7 +224,7 @@ std::size_t JointRefinement::refine(const cv::Mat& reference, const std::vector<
   const int height = own.rows;
   std::vector<std::size_t> gone((height + kStripRows - 1) / kStripRows, 0);
   cv::Mat next(inverse->size(), CV_32FC1), next_weight(inverse->size(), CV_32FC1);
-  for (int iteration = 0; iteration < kIterations; ++iteration) {
+  for (int iteration = 0; iteration < kIterations + scale_ - 1; ++iteration) {
     smoothSurface(*inverse, kNear / widest_, threads_, &next);
     std::swap(*inverse, next);
     parallelFor(0, gone.size(), threads_, [&](std::size_t s) {
@@ -277,7 +283,7 @@ std::size_t JointRefinement::refineStrip(int begin, int end, const cv::Mat& refe
     for (std::size_t k = 0; k < count; ++k) {
       Strip::Image& image = strip->images[k];
       const auto& camera = geometry_.displaced[k];
-      const ProjectionTable& table = tables_[table_of_[k]];
+      const ProjectionTable& table = tables_[table_of_[k]].table;
       const Eigen::Matrix3f R = camera.T_ref_disp.linear().transpose().cast<float>();
       const Eigen::Vector3f t = R * camera.T_ref_disp.translation().cast<float>();
       const float probe =

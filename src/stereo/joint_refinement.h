@@ -45,7 +45,10 @@ class JointRefinement {
   /// pixels [u scale, (u + 1) scale)
   /// @param prior_px standard deviation of what it starts from, in the widest reduced image [px]
   JointRefinement(const StereoGeometry& geometry, int threads, int scale = 1,
-                  float prior_px = 2.0f);
+                  float prior_px = 0.5f);
+
+  /// Other positions for the same reference.
+  void setDisplaced(const std::vector<StereoGeometry::Displaced>& displaced);
 
   /// Improves inverse ranges in place.
   /// @param reference, displaced CV_8UC1, in full size; the others are as large as reduced images
@@ -69,8 +72,13 @@ class JointRefinement {
   int scale_;
   float prior_px_;
   PointMaker rays_;
-  std::vector<ProjectionTable> tables_;  ///< by lens
-  std::vector<std::size_t> table_of_;    ///< by displaced image
+  struct Table {
+    LensPtr lens;
+    cv::Size size;
+    ProjectionTable table;
+  };
+  std::vector<Table> tables_;          ///< by lens and image size
+  std::vector<std::size_t> table_of_;  ///< by displaced image
   float widest_ = 0;  ///< movement in the widest position by inverse range on the axis [px m]
 };
 

@@ -87,6 +87,38 @@ void RangeFusion::add(const MatchResult& pair) {
       8);
 }
 
+void concludeRange(const cv::Mat& inverse, const cv::Mat& weight, const cv::Mat& score,
+                   const MatcherOptions& options, MatchResult* out) {
+  const cv::Size size = inverse.size();
+  // Planes of their own: what the result holds may belong to a matcher.
+  for (cv::Mat* plane : {&out->range, &out->sigma, &out->score}) *plane = cv::Mat(size, CV_32FC1);
+  std::vector<std::size_t> valid(size.height, 0);
+  parallelFor(
+      0, static_cast<std::size_t>(size.height), options.threads,
+      [&](std::size_t row) {
+        const int y = static_cast<int>(row);
+        const float* w = inverse.ptr<float>(y);
+        const float* certain = weight.ptr<float>(y);
+        const float* best = score.ptr<float>(y);
+        float* range = out->range.ptr<float>(y);
+        float* sigma = out->sigma.ptr<float>(y);
+        float* worth = out->score.ptr<float>(y);
+        for (int x = 0; x < size.width; ++x) {
+          range[x] = sigma[x] = worth[x] = kNaN;
+          // Where the parallax drowns in its own error there is no range.
+          if (!(w[x] > 0) || !(w[x] * w[x] * certain[x] > 4)) continue;
+          const float r = 1 / w[x];
+          if (r < options.min_range || (options.max_range > 0 && r > options.max_range)) continue;
+          range[x] = r;
+          sigma[x] = r * r / std::sqrt(certain[x]);
+          worth[x] = best[x];
+          ++valid[row];
+        }
+      },
+      8);
+  out->statistics.valid = std::accumulate(valid.begin(), valid.end(), std::size_t{0});
+}
+
 namespace {
 
 class MultiPositionMatcher : public Matcher {
@@ -130,7 +162,7 @@ class MultiPositionMatcher : public Matcher {
     const auto fused = std::chrono::steady_clock::now();
     statistics.rejected["not confirmed"] = refinement_.refine(reference, displaced, fusion_.support,
                                                               &fusion_.inverse, &fusion_.weight);
-    finish(&out);
+    concludeRange(fusion_.inverse, fusion_.weight, fusion_.score, options_, &out);
     const auto end = std::chrono::steady_clock::now();
     statistics.seconds["refine"] = std::chrono::duration<double>(end - fused).count();
     statistics.seconds["total"] = std::chrono::duration<double>(end - start).count();
@@ -140,37 +172,6 @@ class MultiPositionMatcher : public Matcher {
  private:
   double baseline(std::size_t i) const {
     return geometry_.displaced[i].T_ref_disp.translation().norm();
-  }
-
-  void finish(MatchResult* out) {
-    const cv::Size size = geometry_.reference_size;
-    for (cv::Mat* plane : {&out->range, &out->sigma, &out->score}) plane->create(size, CV_32FC1);
-    std::vector<std::size_t> valid(size.height, 0);
-    parallelFor(
-        0, static_cast<std::size_t>(size.height), options_.threads,
-        [&](std::size_t row) {
-          const int y = static_cast<int>(row);
-          const float* w = fusion_.inverse.ptr<float>(y);
-          const float* weight = fusion_.weight.ptr<float>(y);
-          const float* score = fusion_.score.ptr<float>(y);
-          float* range = out->range.ptr<float>(y);
-          float* sigma = out->sigma.ptr<float>(y);
-          float* worth = out->score.ptr<float>(y);
-          for (int x = 0; x < size.width; ++x) {
-            range[x] = sigma[x] = worth[x] = kNaN;
-            // Where the parallax drowns in its own error there is no range.
-            if (!(w[x] > 0) || !(w[x] * w[x] * weight[x] > 4)) continue;
-            const float r = 1 / w[x];
-            if (r < options_.min_range || (options_.max_range > 0 && r > options_.max_range))
-              continue;
-            range[x] = r;
-            sigma[x] = r * r / std::sqrt(weight[x]);
-            worth[x] = score[x];
-            ++valid[row];
-          }
-        },
-        8);
-    out->statistics.valid = std::accumulate(valid.begin(), valid.end(), std::size_t{0});
   }
 
   StereoGeometry geometry_;

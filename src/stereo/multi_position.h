@@ -33,6 +33,10 @@ class RangeFusion {
   cv::Mat rival_, rival_weight_, rival_support_;
 };
 
+/// Range, sigma and score of an estimate, within the limits of `options`.
+void concludeRange(const cv::Mat& inverse, const cv::Mat& weight, const cv::Mat& score,
+                   const MatcherOptions& options, MatchResult* out);
+
 /// @throws Error as makeMatcher()
 std::unique_ptr<Matcher> makeMultiPositionMatcher(const StereoGeometry& geometry,
                                                   const MatcherOptions& options);

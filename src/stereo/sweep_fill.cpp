@@ -19,8 +19,9 @@ constexpr int kWeakVariance = 49;     ///< of grey values where texture is weak
 constexpr int kRadius = 2;            ///< over which a coarse surface is averaged [px of it]
 constexpr int kCoherent = 60;         ///< least region of a coarse level [px of it]
 constexpr float kSurface = 1.0f;      ///< steps that neighbours on a surface differ by at most
-constexpr float kPrior = 0.5f;        ///< error of a coarse surface [px of the half image]
+constexpr float kPrior = 0.1f;        ///< error of a coarse surface [px of the half image]
 constexpr float kAgree = 9.0f;        ///< variances that two estimates of one pixel may differ by
+constexpr float kSpread = 2.0f;       ///< of what neighbours share, in standard deviation
 constexpr float kSame = 2.0f;         ///< coarse steps that two views of one spot may differ by
 
 /// Mean over a window of those within `near` of the middle; rows first, then columns.
@@ -242,14 +243,14 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
           if (std::isnan(line[x])) {
             if (spots.taken(x, y, found, kSame * step)) continue;
             line[x] = found;
-            to[x] = spread;
+            to[x] = kSpread * spread;
             continue;
           }
           const float own = job.certainty(x, y), theirs = 1 / (spread * spread);
           const float apart = found - line[x];
           if (theirs < own || apart * apart > kAgree * (1 / own + 1 / theirs)) continue;
           line[x] += apart * theirs / (own + theirs);
-          to[x] = 1 / std::sqrt(own + theirs);
+          to[x] = kSpread / std::sqrt(own + theirs);
         }
       },
       8);

@@ -47,7 +47,7 @@ constexpr std::int32_t kUnclaimed = std::numeric_limits<std::int32_t>::max();
 constexpr float kEdgeJump = 1.5f;         ///< columns between surfaces at an edge
 constexpr int kSpeckle = 100;             ///< regions of fewer pixels go,
 constexpr int kSpeckleShare = 3000;       ///< or of less than this part of the image
-constexpr float kMatchedVariance = 4.0f;  ///< of matches in weak texture, times what costs say
+constexpr float kMatchedVariance = 9.0f;  ///< of matches in weak texture, times what costs say
 constexpr int kFilledCost = 300;          ///< of matches taken from coarser levels
 constexpr float kWorstShare = 0.34f;      ///< of it, that a match may cost; chance gives a half
 

@@ -11,7 +11,9 @@
 #include <random>
 
 #include "analytic_scene.h"
+#include "omnister/common/error.h"
 #include "omnister/lens/lens_models.h"
+#include "omnister/stereo/stream_matcher.h"
 #include "stereo/joint_refinement.h"
 
 namespace omnister {
@@ -121,8 +123,8 @@ struct Quality {
 template <typename Where>
 Quality judge(const MatchResult& result, const Where& where) {
   Quality quality;
-  for (int y = 0; y < kSize.height; ++y) {
-    for (int x = 0; x < kSize.width; ++x) {
+  for (int y = 0; y < kSize.height; y += 2) {
+    for (int x = 0; x < kSize.width; x += 2) {
       if (!where(x, y)) continue;
       ++quality.truth;
       const double range = result.range.at<float>(y, x);
@@ -140,7 +142,7 @@ TEST(MultiPosition, TravelTightensRange) {
   const Quality two = judge(scan().match({0}), everywhere);
   const Quality three = judge(scan().match({0, 1}), everywhere);
   const Quality five = judge(scan().match({0, 1, 2, 3}), everywhere);
-  ASSERT_GT(two.truth, 30000u);
+  ASSERT_GT(two.truth, 7500u);
   EXPECT_GT(five.density(), 0.97);
   EXPECT_LT(three.median(), 0.6 * two.median());
   EXPECT_LT(five.median(), 0.25 * two.median());
@@ -163,7 +165,7 @@ TEST(MultiPosition, NearPositionsSeeWhatTheFarOneCannot) {
   };
   const MatchResult of_five = scan().match({0, 1, 2, 3});
   const Quality two = judge(scan().match({3}), hidden), five = judge(of_five, hidden);
-  ASSERT_GT(five.truth, 150u);
+  ASSERT_GT(five.truth, 40u);
   EXPECT_GT(five.density(), two.density() + 0.3);
   EXPECT_GT(five.right(0.05), two.right(0.05) + 0.3);
   const Quality five_all =
@@ -246,6 +248,36 @@ TEST(MultiPosition, LimitsOfRangeAndMaskHold) {
   }
   EXPECT_EQ(valid, result.statistics.valid);
   EXPECT_GT(valid, 4000u);
+}
+
+TEST(Stream, DepthGetsBetterWithTravel) {
+  const auto everywhere = [](int x, int y) { return seen(scan(), x, y, scan().poses[3]); };
+  MatcherOptions options;
+  options.min_range = 0.7;
+  StreamMatcher stream(options, 3);
+  EXPECT_THROW(stream.add({lens(), kSize, scan().poses[0]}, scan().images[0]), Error);
+  for (int time = 0; time < 2; ++time) {
+    stream.setReference(lens(), scan().reference.image);
+    EXPECT_EQ(stream.frames(), 0);
+    double last = 1, first = 0;
+    for (std::size_t i = 0; i < 4; ++i) {
+      const MatchResult result =
+          stream.add({lens(), kSize, scan().poses[i]}, scan().images[i].clone());
+      const Quality quality = judge(result, everywhere);
+      EXPECT_GT(quality.density(), 0.95);
+      EXPECT_LT(quality.median(), 0.9 * last) << i;
+      last = quality.median();
+      if (i == 0) first = last;
+    }
+    EXPECT_LT(last, 0.35 * first);
+    EXPECT_EQ(stream.frames(), 4);
+    EXPECT_EQ(stream.framesKept(), 3);
+    // A frame from where the reference stands changes nothing.
+    EXPECT_THROW(stream.add({lens(), kSize, Pose::Identity()}, scan().images[0]), Error);
+    EXPECT_EQ(stream.frames(), 4);
+  }
+  EXPECT_THROW(stream.setReference(lens(), cv::Mat(10, 10, CV_16UC1, cv::Scalar(1))), Error);
+  EXPECT_THROW(StreamMatcher(options, 0), Error);
 }
 
 TEST(Refinement, HalvesTheErrorOfAPair) {
