@@ -286,6 +286,7 @@ void addBag(CLI::App& app) {
       ->check(CLI::IsMember({"sweep", "thesis"}))
       ->capture_default_str();
   command->add_option("--threads", options.matching.threads, "Threads; 0: every core")
+      ->check(CLI::Range(0, 1024))
       ->capture_default_str();
   command->add_option("--mask", arguments->mask, "Image; pixels that are 0 in it are left out")
       ->type_name("IMAGE");

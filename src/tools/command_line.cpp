@@ -179,6 +179,12 @@ int runCommandLine(int argc, const char* const* argv) {
   for (const AddCommand add : kCommands) {
     add(app);
   }
+  // --help is looked at before anything else, and would hide it.
+  if (argc > 1 && argv[1][0] != '-' && app.get_subcommand_no_throw(argv[1]) == nullptr) {
+    std::cerr << "omnister: there is no subcommand '" << printable(argv[1], 60)
+              << "'; omnister --help lists them\n";
+    return 2;
+  }
   try {
     app.parse(argc, argv);
     closeProgressLine();

@@ -219,9 +219,6 @@ double median(std::vector<double> values) {
 }
 
 void runStereo(StereoArguments& arguments, bool json) {
-  if (arguments.repeat < 1 || arguments.repeat > 100000) {
-    throw Error("--repeat is " + std::to_string(arguments.repeat) + ", expected 1 to 100000");
-  }
   checkFiles(arguments);
   cv::setNumThreads(threadCount(std::clamp(arguments.options.threads, 0, kMaxThreads)));
 
@@ -353,10 +350,12 @@ void addStereo(CLI::App& app) {
                     "Let grey values have the last word on a pair's ranges: half the error for a few "
                     "times the time; several displaced images always are refined");
   command->add_option("--threads", arguments->options.threads, "Threads; 0: every core")
+      ->check(CLI::Range(0, 1024))
       ->capture_default_str();
   command
       ->add_option("--repeat", arguments->repeat,
                    "Match the same images this often after one set-up; times are the medians")
+      ->check(CLI::Range(1, 100000))
       ->capture_default_str();
   command
       ->add_option("--mask", arguments->mask,

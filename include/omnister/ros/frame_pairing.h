@@ -71,7 +71,7 @@ class FramePairing {
   /// Frames are kept; the next set is made by these. @throws Error as the constructor
   void setOptions(const PairingOptions& options);
 
-  /// @param now time by the clock that stamps are from [ns]
+  /// @param now_ns time by the clock that stamps are from [ns]
   void add(PairingFrame frame, std::int64_t now_ns);
 
   /// Looks up poses of the waiting frames. @return the newest complete set, if one came up since

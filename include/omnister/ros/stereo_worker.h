@@ -44,7 +44,7 @@ class StereoWorker {
   void configure(std::string matcher, MatcherOptions options);
 
   /// @param reference, displaced lenses of the cameras that the images are from
-  /// @param names of the two image streams, for messages
+  /// @param reference_name, displaced_name of the two image streams, for messages
   /// @throws InputError for images that are not those of the lenses, or no pictures
   static PreparedSet prepare(const StereoSet& set, const LensFile& reference,
                              const LensFile& displaced, const std::string& reference_name,

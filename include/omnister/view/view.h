@@ -62,7 +62,8 @@ std::optional<Eigen::Vector2d> viewPixel(const ViewGeometry& geometry, const Eig
 /// thread.
 class View {
  public:
-  /// @param lens @param lens_size of the camera's images [px], at most 32766 a side
+  /// @param lens of the camera
+  /// @param lens_size of the camera's images [px], at most 32766 a side
   /// @param anti_alias smooth where the view shows the image smaller than it is
   /// @param threads for making the maps; 0: every core
   /// @throws Error for sizes out of range

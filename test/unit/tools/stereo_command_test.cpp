@@ -227,7 +227,15 @@ TEST_F(StereoCommand, RefusesBadInputAndTouchesNothing) {
   EXPECT_THAT(refusal(arguments({{"--min-range", "3"}, {"--max-range", "2"}})),
               HasSubstr("not below"));
   EXPECT_THAT(refusal(arguments({{"--hypotheses", "2000000"}})), HasSubstr("hypotheses"));
-  EXPECT_THAT(refusal(arguments({{"--repeat", "0"}})), HasSubstr("--repeat"));
+  EXPECT_EQ(run(arguments({{"--repeat", "0"}})).code, 2);
+  EXPECT_EQ(run(arguments({{"--threads", "-1"}})).code, 2);
+  for (const std::vector<std::string>& call :
+       {std::vector<std::string>{"nope"}, {"nope", "--help"}, {"", "--help"}}) {
+    const Outcome unknown = run(call);
+    EXPECT_EQ(unknown.code, 2);
+    EXPECT_EQ(unknown.out, "");
+    EXPECT_THAT(unknown.err, HasSubstr("no subcommand '" + call[0] + "'"));
+  }
   EXPECT_THAT(refusal(arguments({{"--thesis-window", "4"}})), HasSubstr("thesis mask"));
   // Outputs.
   EXPECT_THAT(refusal(arguments({{"--cloud", path("cloud.obj")}})), HasSubstr("cloud.obj"));
