@@ -3,6 +3,7 @@
 
 #include <unistd.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <csignal>
@@ -180,7 +181,9 @@ int runCommandLine(int argc, const char* const* argv) {
     add(app);
   }
   // --help is looked at before anything else, and would hide it.
-  if (argc > 1 && argv[1][0] != '-' && app.get_subcommand_no_throw(argv[1]) == nullptr) {
+  const auto named = [&](const CLI::App* command) { return command->check_name(argv[1]); };
+  const std::vector<CLI::App*> commands = app.get_subcommands([](CLI::App*) { return true; });
+  if (argc > 1 && argv[1][0] != '-' && std::none_of(commands.begin(), commands.end(), named)) {
     std::cerr << "omnister: there is no subcommand '" << printable(argv[1], 60)
               << "'; omnister --help lists them\n";
     return 2;
