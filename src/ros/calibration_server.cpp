@@ -177,8 +177,8 @@ CalibrationServer::~CalibrationServer() {
   }
   wake_.notify_all();
   progress_.notify_all();
-  // Joins the thread of execute(), which sees stopping_.
-  server_.reset();
+  // Joins the thread of execute(), which sees stopping_ and still needs the server.
+  server_->shutdown();
   image_subscriber_.shutdown();
   worker_.join();
 }

@@ -3,29 +3,18 @@
 
 #include <vector>
 
+#include "omnister/lens/lens_file.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/parameters.h"
 
 namespace omnister {
 namespace {
 
-/// The stage of the rig outlives its driver, as hardware does: the driver opens and closes a link
-/// to it.
-class LinkToStage : public device::Stage {
- public:
-  explicit LinkToStage(std::shared_ptr<sim::SimulatedStage> stage) : stage_(std::move(stage)) {}
-  device::StageIdentity identity() const override { return stage_->identity(); }
-  device::StageReading read() override { return stage_->read(); }
-  void moveTo(double position_m, double speed_mps) override {
-    stage_->moveTo(position_m, speed_mps);
-  }
-  void stop() override { stage_->stop(); }
-  void home() override { stage_->home(); }
-  void recover() override { stage_->recover(); }
-
- private:
-  std::shared_ptr<sim::SimulatedStage> stage_;
-};
+/// Where links to serial ports may be made by anybody who runs a rig.
+std::string defaultPort() {
+  const char* runtime = getenv("XDG_RUNTIME_DIR");
+  return std::string(runtime && *runtime ? runtime : "/tmp") + "/omnister_stage";
+}
 
 }  // namespace
 
@@ -36,6 +25,7 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
   p.lens = source.text("lens", "");
   p.boards = source.text("boards", "");
   p.camera_pose = source.pose("camera_pose", p.camera_pose);
+  p.axis = source.direction("axis", p.axis);
   p.stage.travel_m = source.number("travel", p.stage.travel_m, 1e-3, 100.0, "m");
   p.stage.max_speed_mps = source.number("max_speed", p.stage.max_speed_mps, 1e-6, 100.0, "m/s");
   p.stage.acceleration_mps2 =
@@ -44,6 +34,14 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
       source.number("homing_speed", p.stage.homing_speed_mps, 1e-6, 100.0, "m/s");
   p.stage.start_m = source.number("start", p.stage.start_m, 0.0, p.stage.travel_m, "m");
   p.stage.homed = source.flag("homed", p.stage.homed);
+  p.controller = source.choice("controller", p.controller, {"zaber", "grbl"});
+  p.port = source.text("port", defaultPort());
+  p.unit_m = source.number("unit_m", p.unit_m, 1e-10, 1e-3, "m");
+  p.camera.interface = source.text("camera_address", p.camera.interface);
+  p.camera.serial = source.text("camera_serial", p.camera.serial);
+  p.camera.frame_rate_hz = source.number("frame_rate", p.camera.frame_rate_hz, 0.05, 1000.0, "Hz");
+  p.camera.exposure_us = source.number("exposure_us", p.camera.exposure_us, 10.0, 1e6, "us");
+  p.camera.packet_loss = source.number("packet_loss", p.camera.packet_loss, 0.0, 1.0);
   p.render.supersampling = source.integer("supersampling", 2, 1, 16);
   p.render.adaptive = source.flag("adaptive", false);
   p.render.noise_sigma = source.number("noise", 0.0, 0.0, 255.0, "grey levels");
@@ -55,9 +53,13 @@ SimRigParameters loadSimRigParameters(const ros::NodeHandle& private_node) {
   return p;
 }
 
-SimRig::SimRig(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
-               const SimRigParameters& parameters)
-    : board_(std::make_shared<std::atomic<int>>(-1)),
+std::string SimRig::stageDevice() const {
+  return parameters_.controller + ":" + parameters_.port.string();
+}
+
+SimRig::SimRig(const ros::NodeHandle& private_node, const SimRigParameters& parameters)
+    : parameters_(parameters),
+      board_(std::make_shared<std::atomic<int>>(-1)),
       stage_(std::make_shared<sim::SimulatedStage>(parameters.stage)) {
   const sim::ScenePtr scene = sim::readScene(parameters.scene);
   std::vector<sim::ScenePtr> with_board;
@@ -70,30 +72,34 @@ SimRig::SimRig(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
   }
   const LensFile truth = readLensFile(parameters.lens);
 
-  const ros::NodeHandle stage_private(private_node, "stage");
-  StageParameters stage_defaults;
-  stage_defaults.max_m = parameters.stage.travel_m;
-  // The link's y points left: a positive position is to the right.
-  stage_defaults.axis = -Eigen::Vector3d::UnitY();
-  const StageParameters stage_parameters = loadStageParameters(stage_private, stage_defaults);
-
-  const ros::NodeHandle camera_private(private_node, "camera");
-  CameraParameters camera_parameters = loadCameraParameters(camera_private);
-  if (camera_parameters.parent_frame_id.empty()) {
-    camera_parameters.parent_frame_id = stage_parameters.child_frame_id;
+  if (parameters.controller == "grbl") {
+    sim::GrblOptions options;
+    options.link = parameters.port;
+    controller_ = std::make_unique<sim::GrblSimulator>(options, stage_, parameters.stage);
+  } else {
+    sim::ZaberOptions options;
+    options.link = parameters.port;
+    options.unit_m = parameters.unit_m;
+    controller_ = std::make_unique<sim::ZaberSimulator>(options, stage_, parameters.stage);
   }
 
-  const Pose T_carriage_optical = camera_parameters.mount * opticalInLink();
-  const Pose T_world_base = parameters.camera_pose * T_carriage_optical.inverse();
-  const sim::PoseAt pose = [stage = stage_, T_world_base, T_carriage_optical,
-                            axis = stage_parameters.axis](device::Stamp time) -> Pose {
-    return T_world_base * Eigen::Translation3d(axis * stage->truePosition(time)) *
-           T_carriage_optical;
-  };
-  const sim::SceneAt scene_at = [scene, with_board, board = board_](device::Stamp) {
-    const int pose = board->load();
-    return pose < 0 ? scene : with_board[static_cast<std::size_t>(pose)];
-  };
+  sim::GigeServerOptions camera = parameters.camera;
+  camera.size = truth.image_size;
+  camera.color = parameters.render.color;
+  const auto renderer =
+      std::make_shared<sim::Renderer>(*truth.lens, truth.image_size, parameters.render.threads);
+  const Eigen::Vector3d direction = opticalInLink().linear().transpose() * parameters.axis;
+  server_ = std::make_unique<sim::GigeServer>(
+      camera,
+      [renderer, scene, with_board, direction, board = board_, stage = stage_,
+       pose = parameters.camera_pose, render = parameters.render](device::Stamp time) mutable {
+        const int shown = board->load();
+        const sim::ScenePtr& seen = shown < 0 ? scene : with_board[static_cast<std::size_t>(shown)];
+        ++render.seed;
+        const Pose T_world_optical =
+            pose * Eigen::Translation3d(direction * stage->truePosition(time));
+        return renderer->render(*seen, T_world_optical, render).image;
+      });
   if (!with_board.empty()) {
     using Request = std_srvs::SetBool::Request;
     using Response = std_srvs::SetBool::Response;
@@ -108,23 +114,6 @@ SimRig::SimRig(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
           return true;
         });
   }
-
-  stage_driver_ = std::make_unique<StageDriver>(
-      ros::NodeHandle(node, "stage"), stage_private, stage_parameters,
-      [stage = stage_] { return std::make_unique<LinkToStage>(stage); });
-  camera_driver_ = std::make_unique<CameraDriver>(
-      ros::NodeHandle(node, "camera"), camera_private, camera_parameters,
-      [parameters, truth, scene_at, pose](const CameraParameters& camera) {
-        sim::SimulatedCameraOptions options;
-        options.lens = truth.lens;
-        options.size = truth.image_size;
-        options.render = parameters.render;
-        options.frame_rate_hz = camera.settings.frame_rate_hz > 0.0 ? camera.settings.frame_rate_hz
-                                                                    : parameters.frame_rate_hz;
-        options.exposure_s = camera.settings.exposure_us ? *camera.settings.exposure_us * 1e-6
-                                                         : parameters.exposure_s;
-        return sim::makeSimulatedCamera(options, scene_at, pose);
-      });
 }
 
 }  // namespace omnister

@@ -7,7 +7,7 @@ int main(int argc, char** argv) {
   ros::init(argc, argv, "sim_rig");
   try {
     const ros::NodeHandle private_node("~");
-    const omnister::SimRig rig(ros::NodeHandle(), private_node,
+    const omnister::SimRig rig(private_node,
                                omnister::loadSimRigParameters(private_node));
     ros::spin();
   } catch (const std::exception& e) {

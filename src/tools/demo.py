@@ -22,7 +22,7 @@ BOARD_PATIENCE = 6.0  # before the board is held elsewhere though no view was ta
 POSITIONS = [0.0, 0.1, 0.2, 0.3, 0.4]  # of the scan [m]
 ARTEFACTS = ['lens.yaml', 'cloud.ply', 'range.tiff', 'run.bag', 'cloud.png']
 RECORDED = ['/camera/image_raw', '/camera/camera_info', '/camera/lens_model', '/camera/points2',
-            '/camera/range', '/stage/joint_states', '/stage/stage_state', '/tf', '/tf_static', '/diagnostics',
+            '/camera/range', '/camera/stage_frames', '/stage/joint_states', '/stage/stage_state', '/tf', '/tf_static', '/diagnostics',
             '/rosout_agg']
 
 
@@ -217,19 +217,18 @@ class Rig:
                         2.0 * 57.29578 * result.max_theta))
         return result.lens_file
 
-    def move(self, position):
-        self.act('/stage/move_stage', 'MoveStage', self.msg.MoveStageGoal(position=position), 30.0)
+    def stop_at(self, position):
+        """Until the stage and the picture stand still there."""
+        self.act('/camera/scan', 'Scan', self.msg.ScanGoal(positions=[position]), 30.0)
 
     def scan(self, positions):
         """Stops at each position until a cloud taken there has come. The first ones have no baseline yet."""
         for index, position in enumerate(positions):
-            self.move(position)
+            self.stop_at(position)
             arrived = self.rospy.Time.now().to_sec()
             if index >= 2:
                 self.clock.wait('a cloud at %.1f m' % position,
                                 lambda: self.cloud_stamp > arrived, 30.0)
-            else:
-                time.sleep(1.0)
             self.clock.say('scan: stage at %.1f m, %d clouds so far' % (position, self.clouds))
 
 
@@ -293,7 +292,7 @@ def check_bag(path):
             topics = bag.get_type_and_topic_info().topics
     except (rosbag.ROSBagException, OSError) as error:
         raise Failure('the bag cannot be read: %s' % error)
-    for topic in ('/camera/image_raw', '/camera/lens_model', '/camera/points2', '/tf'):
+    for topic in ('/camera/image_raw', '/camera/lens_model', '/camera/points2', '/camera/stage_frames', '/tf'):
         if topic not in topics:
             raise Failure('the bag holds no %s' % topic)
     return topics
@@ -316,7 +315,8 @@ def conduct(options, clock, processes, work):
         'roslaunch',
         ['roslaunch', '--skip-log-check', '-p', str(port), 'omnister', 'demo.launch',
          'gui:=%s' % str(not options.headless).lower(), 'store:=%s' % work,
-         'cloud:=%s' % (work / 'cloud.ply'), 'range:=%s' % (work / 'range.tiff')], watch)
+         'cloud:=%s' % (work / 'cloud.ply'), 'range:=%s' % (work / 'range.tiff'),
+         'port:=%s' % (work / 'stage')], watch)
 
     def master_is_up():
         if launch.poll() is not None:

@@ -13,7 +13,7 @@
 #include "omnister/common/file_io.h"
 #include "omnister/ros/calibration_server.h"
 #include "omnister/ros/conversions.h"
-#include "omnister/ros/sim_rig.h"
+#include "ros/rig_drivers.h"
 #include "ros/ros_test.h"
 
 namespace omnister {
@@ -50,13 +50,13 @@ SimRigParameters rigParameters() {
   parameters.lens = kSource + "/config/demo/lens.yaml";
   parameters.stage.homed = true;
   parameters.render.adaptive = true;
-  parameters.frame_rate_hz = 8.0;
+  parameters.camera.frame_rate_hz = 8.0;
   return parameters;
 }
 
 TEST_F(Calibration, FitsTheLensOfTheSimulatedCameraAndTellsEverybody) {
   const SimRigParameters parameters = rigParameters();
-  const SimRig rig(node_, ros::NodeHandle("~rig"), parameters);
+  const test::RigWithDrivers rig(node_, ros::NodeHandle("~rig"), parameters);
   const CalibrationServer calibration(camera_node_, private_node_);
   Collector<LensModelMessage> lenses(camera_node_, "lens_model");
   Collector<sensor_msgs::Image> residuals(camera_node_, "residuals");
