@@ -611,6 +611,11 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
         lattice[j * lattice_x + i] = project(band, row, column);
       }
     });
+    std::vector<std::pair<double, double>> circle(hi - lo + 1);
+    for (int column = lo; column <= hi; ++column) {
+      const double theta = thetaOf(map.axis, column * band.step_h / column_sign_scale);
+      circle[column - lo] = {std::cos(theta), std::sin(theta)};
+    }
     parallelFor(0, band.rows, threads, [&](std::size_t r) {
       if (band.runs[r] == 0) return;
       const int row = static_cast<int>(r);
@@ -641,8 +646,14 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
         return u >= margin - 0.49f && v >= margin - 0.49f && u <= width - 0.51f - margin &&
                v <= height - 0.51f - margin;
       };
-      const auto depth = [&](double column) {
-        return legal(band, column) ? rayOf(band, row, column).z() - lens.cos_max_theta : -2.0;
+      // Depth along the optical axis is linear in the cosine and the sine of theta.
+      const double phi = (row - band.row_offset) * band.step_phi - kPi;
+      const double along = turned(2, 0);
+      const double across = turned(2, 1) * std::cos(phi) + turned(2, 2) * std::sin(phi);
+      const auto depth = [&](int column) {
+        if (!legal(band, column)) return -2.0;
+        const auto& [cosine, sine] = circle[column - lo];
+        return along * cosine + across * sine - lens.cos_max_theta;
       };
       double depth0 = depth(band.begin[r]);
       for (int n = 0; n < band.runs[r]; ++n) {

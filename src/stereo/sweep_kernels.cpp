@@ -479,21 +479,36 @@ void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
     const auto none = hn::Eq(p, hn::Set(di, kNoRay));
     const auto gap = hn::Sub(hn::ConvertTo(df, whole), column);
     hn::StoreU(hn::IfThenZeroElse(hn::RebindMask(df, none), gap), df, residual + x);
-    for (int i = 0; i < lanes; ++i) rows[i] = origin[rows[i]];
+    // Neighbours share a row of cells or two.
+    const auto clamped = hn::Load(di, rows);
+    const auto one = hn::Eq(clamped, hn::Set(di, rows[0]));
+    const auto two = hn::Eq(clamped, hn::Set(di, rows[lanes - 1]));
+    auto begin = hn::Set(di, origin[rows[0]]);
+    if (!hn::AllTrue(di, one)) {
+      begin = hn::IfThenElse(one, begin, hn::Set(di, origin[rows[lanes - 1]]));
+      if (!hn::AllTrue(di, hn::Or(one, two))) {
+        for (int i = 0; i < lanes; ++i) rows[i] = origin[rows[i]];
+        begin = hn::Load(di, rows);
+      }
+    }
     // Where there is no ray, and in a stray halo, any cell will do.
-    const auto cell =
-        hn::Min(hn::Max(hn::Add(hn::Load(di, rows), whole), hn::Zero(di)), hn::Set(di, job.cells));
+    const auto cell = hn::Min(hn::Max(hn::Add(begin, whole), hn::Zero(di)), hn::Set(di, job.cells));
     hn::StoreU(hn::IfThenZeroElse(none, cell), di, base + x);
   }
 }
 
-void BoxMeanRow(const float* in, int stride, int count, float* HWY_RESTRICT line,
+void BoxMeanRow(const float* in, int stride, int count, bool next, float* HWY_RESTRICT line,
                 float* HWY_RESTRICT out) {
   const hn::ScalableTag<float> d;
   const int lanes = static_cast<int>(hn::Lanes(d));
   for (int x = 0; x < count + kWindow - 1; x += lanes) {
-    auto sum = hn::LoadU(d, in + x);
-    for (int k = 1; k < kWindow; ++k) sum = hn::Add(sum, hn::LoadU(d, in + k * stride + x));
+    auto sum = hn::Zero(d);
+    if (next) {
+      sum = hn::Add(hn::LoadU(d, line + x), hn::Sub(hn::LoadU(d, in + (kWindow - 1) * stride + x),
+                                                    hn::LoadU(d, in - stride + x)));
+    } else {
+      for (int k = 0; k < kWindow; ++k) sum = hn::Add(sum, hn::LoadU(d, in + k * stride + x));
+    }
     hn::StoreU(sum, d, line + x);
   }
   const auto scale = hn::Set(d, 1.0f / (kWindow * kWindow));
@@ -837,8 +852,8 @@ void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
   HWY_DYNAMIC_DISPATCH(MapRow)(job, phi, a, count, base, residual);
 }
 
-void boxMeanRow(const float* in, int stride, int count, float* line, float* out) {
-  HWY_DYNAMIC_DISPATCH(BoxMeanRow)(in, stride, count, line, out);
+void boxMeanRow(const float* in, int stride, int count, bool next, float* line, float* out) {
+  HWY_DYNAMIC_DISPATCH(BoxMeanRow)(in, stride, count, next, line, out);
 }
 
 void concludeRow(ConcludeJob* job) { HWY_DYNAMIC_DISPATCH(ConcludeRow)(job); }

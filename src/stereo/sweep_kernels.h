@@ -123,8 +123,9 @@ void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
             std::int32_t* base, float* residual);
 
 /// Mean of the window, for `count` pixels of a row whose windows begin at `in`.
-/// @param line room for count + kWindow
-void boxMeanRow(const float* in, int stride, int count, float* line, float* out);
+/// @param next whether `line` is as the call for the row above left it
+/// @param line room for count + kWindow, rounded up to a vector
+void boxMeanRow(const float* in, int stride, int count, bool next, float* line, float* out);
 
 /// From costs to hypotheses, one row of a tile.
 struct ConcludeJob {

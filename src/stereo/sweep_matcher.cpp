@@ -35,7 +35,8 @@ constexpr float kMiddleX = 32, kMiddleY = 24;   ///< where planes are fitted abo
 constexpr int kNarrowLanes = 14;                ///< hypotheses of the cheapest chunk
 constexpr int kSearchMargin = 3;                ///< columns beyond what the coarser level found
 constexpr int kMostPlanes = 3;                  ///< of a tile
-constexpr int kNeeded = 4, kNeededShare = 200;  ///< samples that make the search go somewhere
+constexpr int kSampleStep = 3;                  ///< pixels of the coarser level between samples
+constexpr int kNeeded = 3, kNeededShare = 150;  ///< samples that make the search go somewhere
 constexpr float kOnPlane = 3.4f;                ///< columns off a plane that still belong to it,
 constexpr float kFarOff = 16;                   ///< or are looked for from it
 constexpr int kBeyond = 8;                      ///< pixels around where a plane was seen
@@ -322,9 +323,9 @@ class SweepMatcher : public SweepPair {
     std::vector<Sample>& samples = scratch->samples;
     samples.clear();
     int seen = 0;
-    for (int y = y0; y < y1; y += 2) {
+    for (int y = y0; y < y1; y += kSampleStep) {
       const float* line = coarse.ptr<float>(y);
-      for (int x = x0 + (y / 2 % 2); x < x1; x += 2) {
+      for (int x = x0 + y % 2; x < x1; x += kSampleStep) {
         ++seen;
         const float columns = line[x] * to_columns;
         if (columns >= least - 2 && columns <= most + 2)  // neither NaN nor beyond
@@ -431,7 +432,7 @@ class SweepMatcher : public SweepPair {
 
   /// The plane through three neighbouring samples that most others lie on.
   static bool samplePlane(const std::vector<Sample>& samples, int needed, Guess* guess) {
-    constexpr int kTrials = 24;
+    constexpr int kTrials = 20;
     const std::size_t n = samples.size();
     const std::size_t stride = std::max<std::size_t>(1, n / 96);
     std::uint32_t random = 12345;
@@ -441,7 +442,7 @@ class SweepMatcher : public SweepPair {
       random = random * 1664525u + 1013904223u;
       const std::size_t i = (random >> 8) % n;
       const Sample &a = samples[i], &b = samples[(i + 3 + trial % 4) % n];
-      const Sample& c = samples[(i + 60 + trial) % n];
+      const Sample& c = samples[(i + 42 + trial) % n];
       const float bx = b.x - a.x, by = b.y - a.y, cx = c.x - a.x, cy = c.y - a.y;
       const float area = bx * cy - by * cx;
       if (std::fabs(area) < 40) continue;
@@ -671,6 +672,7 @@ class SweepMatcher : public SweepPair {
     } else {
       scratch->best_cost.resize(tile.rect.area());
     }
+    const std::size_t h_step = level.h.step1(), claim_step = claim_.step1();
     ConcludeJob job;
     job.count = where.width;
     job.residual = scratch->residual_mean.data();
@@ -687,8 +689,8 @@ class SweepMatcher : public SweepPair {
     for (int y = 0; y < where.height; ++y) {
       const std::size_t corner =
           static_cast<std::size_t>(guess.where.y + y) * stride + guess.where.x;
-      boxMeanRow(&scratch->residual[corner], stride, where.width, scratch->residual_line.data(),
-                 scratch->residual_mean.data());
+      boxMeanRow(&scratch->residual[corner], stride, where.width, y > 0,
+                 scratch->residual_line.data(), scratch->residual_mean.data());
       const std::size_t i = static_cast<std::size_t>(y) * where.width;
       const std::size_t pixel = scratch->view.at(where.x, where.y + y);
       job.cost = &scratch->cost[i];
@@ -712,8 +714,8 @@ class SweepMatcher : public SweepPair {
       }
       if (y + 2 < where.height) {
         for (int x = 0; x < where.width; x += 16) {
-          __builtin_prefetch(h + 2 * level.h.step1() + x, 1);
-          if (l == 0) __builtin_prefetch(claim + 2 * claim_.step1() + x, 1);
+          __builtin_prefetch(h + 2 * h_step + x, 1);
+          if (l == 0) __builtin_prefetch(claim + 2 * claim_step + x, 1);
         }
       }
       job.h = merge ? scratch->row_h.data() : h;
@@ -729,15 +731,17 @@ class SweepMatcher : public SweepPair {
         if (where.br().x == level.h.cols) std::fill_n(h + where.width, 16, kNaN);
         continue;
       }
-      for (int x = 0; x < where.width; ++x) {
-        if (job.cost[x] >= best[x]) continue;
-        best[x] = job.cost[x];
-        h[x] = job.h[x];
-        if (l > 0) continue;
-        cost[x] = job.cost[x];
-        steep[x] = job.steep[x];
-        claim[x] = job.claim[x];
+      // Without branches, so that these become vectors.
+      for (int x = 0; x < where.width; ++x) h[x] = job.cost[x] < best[x] ? job.h[x] : h[x];
+      if (l == 0) {
+        for (int x = 0; x < where.width; ++x) {
+          steep[x] = job.cost[x] < best[x] ? job.steep[x] : steep[x];
+          cost[x] = std::min(cost[x], job.cost[x]);
+        }
+        for (int x = 0; x < where.width; ++x)
+          claim[x] = job.cost[x] < best[x] ? job.claim[x] : claim[x];
       }
+      for (int x = 0; x < where.width; ++x) best[x] = std::min(best[x], job.cost[x]);
     }
   }
 
@@ -788,7 +792,7 @@ class SweepMatcher : public SweepPair {
               Stopwatch* watch) {
     Level& level = levels_.front();
     const int width = level.map.size.width, height = level.map.size.height;
-    constexpr int kStrip = 16;
+    constexpr int kStrip = 32;
     const int strips = (height + kStrip - 1) / kStrip;
     const auto forRows = [&](const auto& body) {
       parallelFor(0, strips, options_.threads, [&](std::size_t s) {
