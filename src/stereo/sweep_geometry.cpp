@@ -662,6 +662,18 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
         if (std::isfinite(x[n]) && std::isfinite(x[n + 1]) && insideImage(x[n], y[n], 1.0f) &&
             insideImage(x[n + 1], y[n + 1], 1.0f) && depth0 > 0.01 && depth1 > 0.01) {
           mask[n] = 0xFF;
+        } else if (std::isfinite(x[n]) && std::isfinite(x[n + 1]) && depth0 > 0.01 &&
+                   depth1 > 0.01) {
+          // Well inside the field: the cells lie where they will be sampled.
+          std::uint8_t bits = 0;
+          for (int i = 0; i < kRun; ++i) {
+            const float t = static_cast<float>(i) / kRun;
+            if (insideImage(x[n] + t * (x[n + 1] - x[n]), y[n] + t * (y[n + 1] - y[n]), 0.0f))
+              bits |= static_cast<std::uint8_t>(1u << i);
+          }
+          mask[n] = bits;
+        } else if (depth0 < -0.1 && depth1 < -0.1) {
+          mask[n] = 0;
         } else {
           std::uint8_t bits = 0;
           Eigen::Vector2f first, last;
