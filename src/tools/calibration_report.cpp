@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "calibration_report.h"
 
-#include <cairo-svg.h>
-
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -10,6 +8,7 @@
 #include <functional>
 #include <memory>
 
+#include "html_plot.h"
 #include "omnister/calibration/uncertainty.h"
 #include "omnister/common/error.h"
 
@@ -20,139 +19,9 @@ constexpr double kPi = 3.14159265358979323846;
 constexpr int kSectors = 12;
 constexpr int kRings = 6;
 
-std::string fixed(double value, int digits) {
-  if (!std::isfinite(value)) return "-";
-  char text[64];
-  std::snprintf(text, sizeof text, "%.*f", digits, value);
-  return text;
-}
-
-std::string escaped(const std::string& text) {
-  std::string safe;
-  for (const char c : printable(text, 1000)) {
-    switch (c) {
-      case '<':
-        safe += "&lt;";
-        break;
-      case '>':
-        safe += "&gt;";
-        break;
-      case '&':
-        safe += "&amp;";
-        break;
-      case '"':
-        safe += "&quot;";
-        break;
-      default:
-        safe += c;
-    }
-  }
-  return safe;
-}
-
-/// A drawing of one plot: data coordinates inside a frame with a few numbers along its axes.
-class Plot {
- public:
-  Plot(double width, double height, double x0, double x1, double y0, double y1)
-      : width_(width), height_(height), x0_(x0), x1_(x1), y0_(y0), y1_(y1) {
-    surface_.reset(cairo_svg_surface_create_for_stream(&Plot::append, &svg_, width, height));
-    cairo_.reset(cairo_create(surface_.get()));
-    cairo_select_font_face(cairo_.get(), "sans-serif", CAIRO_FONT_SLANT_NORMAL,
-                           CAIRO_FONT_WEIGHT_NORMAL);
-    cairo_set_font_size(cairo_.get(), 11);
-  }
-
-  double x(double value) const {
-    return kLeft + (value - x0_) / (x1_ - x0_) * (width_ - kLeft - kMargin);
-  }
-  double y(double value) const {
-    return height_ - kBottom - (value - y0_) / (y1_ - y0_) * (height_ - kBottom - kMargin);
-  }
-
-  void color(double red, double green, double blue) {
-    cairo_set_source_rgb(cairo_.get(), red, green, blue);
-  }
-  void dot(double px, double py, double radius = 1.3) {
-    cairo_arc(cairo_.get(), x(px), y(py), radius, 0, 2 * kPi);
-    cairo_fill(cairo_.get());
-  }
-  void line(double ax, double ay, double bx, double by) {
-    cairo_set_line_width(cairo_.get(), 1.0);
-    cairo_move_to(cairo_.get(), x(ax), y(ay));
-    cairo_line_to(cairo_.get(), x(bx), y(by));
-    cairo_stroke(cairo_.get());
-  }
-  void box(double ax, double ay, double bx, double by) {
-    cairo_rectangle(cairo_.get(), std::min(x(ax), x(bx)), std::min(y(ay), y(by)),
-                    std::abs(x(bx) - x(ax)), std::abs(y(by) - y(ay)));
-    cairo_fill(cairo_.get());
-  }
-  void text(double px, double py, const std::string& words) {
-    cairo_move_to(cairo_.get(), px, py);
-    cairo_show_text(cairo_.get(), words.c_str());
-  }
-
-  /// Frame, numbers and names of the axes; closes the drawing. @return the SVG element
-  std::string finish(const std::string& x_name, const std::string& y_name, int digits = 0) {
-    color(0, 0, 0);
-    cairo_set_line_width(cairo_.get(), 1.0);
-    cairo_rectangle(cairo_.get(), kLeft, kMargin, width_ - kLeft - kMargin,
-                    height_ - kBottom - kMargin);
-    cairo_stroke(cairo_.get());
-    for (int i = 0; i <= 4; ++i) {
-      const double vx = x0_ + (x1_ - x0_) * i / 4.0;
-      const double vy = y0_ + (y1_ - y0_) * i / 4.0;
-      text(x(vx) - 10, height_ - kBottom + 14, fixed(vx, std::abs(x1_ - x0_) < 5 ? 2 : 0));
-      text(2, y(vy) + 4, fixed(vy, std::abs(y1_ - y0_) < 5 ? std::max(digits, 2) : digits));
-    }
-    text(0.5 * width_ - 40, height_ - 4, x_name);
-    text(2, 10, y_name);
-    cairo_.reset();
-    cairo_surface_finish(surface_.get());
-    return svg_;
-  }
-
- private:
-  static constexpr double kLeft = 48;
-  static constexpr double kBottom = 34;
-  static constexpr double kMargin = 14;
-
-  static cairo_status_t append(void* text, const unsigned char* bytes, unsigned int length) {
-    static_cast<std::string*>(text)->append(reinterpret_cast<const char*>(bytes), length);
-    return CAIRO_STATUS_SUCCESS;
-  }
-
-  struct Release {
-    void operator()(cairo_surface_t* surface) const { cairo_surface_destroy(surface); }
-    void operator()(cairo_t* cairo) const { cairo_destroy(cairo); }
-  };
-  double width_, height_, x0_, x1_, y0_, y1_;
-  std::string svg_;
-  std::unique_ptr<cairo_surface_t, Release> surface_;
-  std::unique_ptr<cairo_t, Release> cairo_;
-};
-
 struct Point {
   Eigen::Vector2d pixel, residual;
 };
-
-/// As an image of its own: drawings inside one page would share the names of their glyphs.
-std::string asImage(const std::string& svg) {
-  static constexpr char kDigits[] =
-      "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-  std::string text = "<img alt=\"\" src=\"data:image/svg+xml;base64,";
-  text.reserve(svg.size() * 4 / 3 + 64);
-  for (std::size_t i = 0; i < svg.size(); i += 3) {
-    unsigned bits = 0;
-    for (std::size_t k = 0; k < 3; ++k) {
-      bits = bits << 8 | (i + k < svg.size() ? static_cast<unsigned char>(svg[i + k]) : 0u);
-    }
-    for (std::size_t k = 0; k < 4; ++k) {
-      text += i + k <= svg.size() ? kDigits[bits >> (18 - 6 * k) & 63u] : '=';
-    }
-  }
-  return text + "\">";
-}
 
 std::string structureText(const LensStructure& structure) {
   std::string text = structure.model;
@@ -163,14 +32,6 @@ std::string structureText(const LensStructure& structure) {
   if (structure.affinity) text += " + affinity";
   if (structure.decentring) text += " + decentring";
   return text;
-}
-
-std::string row(const std::vector<std::string>& cells, const char* tag = "td") {
-  std::string text = "<tr>";
-  for (const std::string& cell : cells) {
-    text += std::string("<") + tag + ">" + cell + "</" + tag + ">";
-  }
-  return text + "</tr>\n";
 }
 
 }  // namespace
@@ -199,13 +60,7 @@ std::string calibrationReport(const std::string& title, const Detections& detect
   const double top =
       lengths.empty() ? 1.0 : std::max(1e-6, 1.3 * lengths[lengths.size() * 99 / 100]);
 
-  std::string html =
-      "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>" + escaped(title) +
-      "</title>\n<style>body{font-family:sans-serif;max-width:1100px;margin:1em auto}"
-      "table{border-collapse:collapse}td,th{border:1px solid #bbb;padding:2px 8px;"
-      "text-align:left}figure{display:inline-block;margin:8px}tr.chosen{background:#dfd}"
-      "</style></head><body>\n<h1>" +
-      escaped(title) + "</h1>\n<table>\n";
+  std::string html = pageHead(title) + "<table>\n";
   html += row({"lens", escaped(result.file.calibration.notes.count("structure")
                                    ? result.file.calibration.notes.at("structure")
                                    : std::string(lens.model()))});

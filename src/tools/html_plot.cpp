@@ -1,0 +1,155 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "html_plot.h"
+
+#include <cairo-svg.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <opencv2/imgcodecs.hpp>
+
+#include "omnister/common/error.h"
+
+namespace omnister::tools {
+namespace {
+
+constexpr double kPi = 3.14159265358979323846;
+
+cairo_status_t append(void* text, const unsigned char* bytes, unsigned int length) {
+  static_cast<std::string*>(text)->append(reinterpret_cast<const char*>(bytes), length);
+  return CAIRO_STATUS_SUCCESS;
+}
+
+std::string base64(const unsigned char* bytes, std::size_t size) {
+  static constexpr char kDigits[] =
+      "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+  std::string text;
+  text.reserve(size * 4 / 3 + 4);
+  for (std::size_t i = 0; i < size; i += 3) {
+    unsigned bits = 0;
+    for (std::size_t k = 0; k < 3; ++k) bits = bits << 8 | (i + k < size ? bytes[i + k] : 0u);
+    for (std::size_t k = 0; k < 4; ++k) {
+      text += i + k <= size ? kDigits[bits >> (18 - 6 * k) & 63u] : '=';
+    }
+  }
+  return text;
+}
+
+}  // namespace
+
+std::string fixed(double value, int digits) {
+  if (!std::isfinite(value)) return "-";
+  char text[64];
+  std::snprintf(text, sizeof text, "%.*f", digits, value);
+  return text;
+}
+
+std::string escaped(const std::string& text) {
+  std::string safe;
+  for (const char c : printable(text, 1000)) {
+    switch (c) {
+      case '<':
+        safe += "&lt;";
+        break;
+      case '>':
+        safe += "&gt;";
+        break;
+      case '&':
+        safe += "&amp;";
+        break;
+      case '"':
+        safe += "&quot;";
+        break;
+      default:
+        safe += c;
+    }
+  }
+  return safe;
+}
+
+std::string row(const std::vector<std::string>& cells, const char* tag) {
+  std::string text = "<tr>";
+  for (const std::string& cell : cells) {
+    text += std::string("<") + tag + ">" + cell + "</" + tag + ">";
+  }
+  return text + "</tr>\n";
+}
+
+std::string pageHead(const std::string& title) {
+  return "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>" +
+         escaped(title) +
+         "</title>\n<style>body{font-family:sans-serif;max-width:1100px;margin:1em auto}"
+         "table{border-collapse:collapse}td,th{border:1px solid #bbb;padding:2px 8px;"
+         "text-align:left}figure{display:inline-block;margin:8px;vertical-align:top}"
+         "figcaption{max-width:520px}tr.chosen{background:#dfd}</style></head><body>\n<h1>" +
+         escaped(title) + "</h1>\n";
+}
+
+std::string asImage(const std::string& svg) {
+  return "<img alt=\"\" src=\"data:image/svg+xml;base64," +
+         base64(reinterpret_cast<const unsigned char*>(svg.data()), svg.size()) + "\">";
+}
+
+std::string asImage(const cv::Mat& image, int width_px) {
+  std::vector<unsigned char> png;
+  if (!cv::imencode(".png", image, png)) throw Error("a picture of the report cannot be encoded");
+  return "<img alt=\"\" width=\"" + std::to_string(width_px) + "\" src=\"data:image/png;base64," +
+         base64(png.data(), png.size()) + "\">";
+}
+
+std::string figure(const std::string& image, const std::string& caption) {
+  return "<figure>" + image + "<figcaption>" + caption + "</figcaption></figure>\n";
+}
+
+Plot::Plot(double width, double height, double x0, double x1, double y0, double y1)
+    : width_(width), height_(height), x0_(x0), x1_(x1), y0_(y0), y1_(y1) {
+  surface_.reset(cairo_svg_surface_create_for_stream(&append, &svg_, width, height));
+  cairo_.reset(cairo_create(surface_.get()));
+  cairo_select_font_face(cairo_.get(), "sans-serif", CAIRO_FONT_SLANT_NORMAL,
+                         CAIRO_FONT_WEIGHT_NORMAL);
+  cairo_set_font_size(cairo_.get(), 11);
+}
+
+void Plot::dot(double px, double py, double radius) {
+  cairo_arc(cairo_.get(), x(px), y(py), radius, 0, 2 * kPi);
+  cairo_fill(cairo_.get());
+}
+
+void Plot::line(double ax, double ay, double bx, double by) {
+  cairo_set_line_width(cairo_.get(), 1.0);
+  cairo_move_to(cairo_.get(), x(ax), y(ay));
+  cairo_line_to(cairo_.get(), x(bx), y(by));
+  cairo_stroke(cairo_.get());
+}
+
+void Plot::box(double ax, double ay, double bx, double by) {
+  cairo_rectangle(cairo_.get(), std::min(x(ax), x(bx)), std::min(y(ay), y(by)),
+                  std::abs(x(bx) - x(ax)), std::abs(y(by) - y(ay)));
+  cairo_fill(cairo_.get());
+}
+
+void Plot::text(double px, double py, const std::string& words) {
+  cairo_move_to(cairo_.get(), px, py);
+  cairo_show_text(cairo_.get(), words.c_str());
+}
+
+std::string Plot::finish(const std::string& x_name, const std::string& y_name, int digits) {
+  color(0, 0, 0);
+  cairo_set_line_width(cairo_.get(), 1.0);
+  cairo_rectangle(cairo_.get(), kLeft, kMargin, width_ - kLeft - kMargin,
+                  height_ - kBottom - kMargin);
+  cairo_stroke(cairo_.get());
+  for (int i = 0; i <= 4; ++i) {
+    const double vx = x0_ + (x1_ - x0_) * i / 4.0;
+    const double vy = y0_ + (y1_ - y0_) * i / 4.0;
+    text(x(vx) - 10, height_ - kBottom + 14, fixed(vx, std::abs(x1_ - x0_) < 5 ? 2 : 0));
+    text(2, y(vy) + 4, fixed(vy, std::abs(y1_ - y0_) < 5 ? std::max(digits, 2) : digits));
+  }
+  text(0.5 * width_ - 40, height_ - 4, x_name);
+  text(2, 10, y_name);
+  cairo_.reset();
+  cairo_surface_finish(surface_.get());
+  return svg_;
+}
+
+}  // namespace omnister::tools
