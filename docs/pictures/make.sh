@@ -24,23 +24,16 @@ DISPLAY=:$(cat "$work/display")
 export DISPLAY
 
 share=$(rospack find omnister)
+# The lens that calibration would find stands in the camera's store.
+mkdir "$work/store"
+cp "$share/config/demo/lens.yaml" "$work/store/demo-camera.yaml"
 cat >"$work/pictures.launch" <<XML
 <launch>
-  <node name="rig" pkg="omnister" type="sim_rig_node">
-    <param name="scene" value="$share/config/scenes/room.yaml"/>
-    <param name="lens" value="$share/config/demo/lens.yaml"/>
-    <param name="travel" value="0.4"/>
-    <param name="max_speed" value="0.3"/>
-    <param name="homed" value="true"/>
-    <param name="camera/frame_rate" value="2"/>
-    <param name="stage/speed_mps" value="0.2"/>
-  </node>
-  <include file="$share/launch/stereo.launch">
-    <arg name="lens" value="$share/config/demo/lens.yaml"/>
-    <arg name="min_baseline" value="0.15"/>
-    <arg name="max_baseline" value="0.25"/>
-    <arg name="max_range" value="12"/>
-    <arg name="max_rate" value="0.7"/>
+  <include file="$share/launch/demo.launch">
+    <arg name="gui" value="false"/>
+    <arg name="store" value="$work/store"/>
+    <arg name="port" value="$work/stage"/>
+    <arg name="camera_address" value="127.0.0.9"/>
   </include>
   <include file="$share/launch/rviz.launch"><arg name="max_m" value="0.4"/></include>
 </launch>
@@ -51,11 +44,16 @@ cat >"$work/take.py" <<'PY'
 import sys
 import numpy
 import rospy
-from omnister.msg import MoveStageActionGoal, MoveStageActionResult, MoveStageGoal
+from omnister.msg import MoveStageActionGoal, MoveStageActionResult, MoveStageGoal, StageState
 from sensor_msgs.msg import Image, PointCloud2
+from std_srvs.srv import Trigger
 
 rospy.init_node('pictures')
 rospy.wait_for_message('/camera/image_raw', Image, 120)
+rospy.wait_for_service('/stage/home', 60)
+rospy.ServiceProxy('/stage/home', Trigger)()
+while not rospy.wait_for_message('/stage/stage_state', StageState, 60).homed:
+    pass
 goals = rospy.Publisher('/stage/move_stage/goal', MoveStageActionGoal, queue_size=1)
 while goals.get_num_connections() == 0:
     rospy.sleep(0.1)

@@ -225,6 +225,10 @@ void stage(const DoctorFacts& facts, Findings& findings) {
   const DoctorFacts::Tf& tf = facts.tf;
   const std::string camera =
       facts.images.empty() ? "camera_optical" : facts.images.front().frame_id;
+  if (stage.fault.find("ermission") != std::string::npos)
+    return findings.error("stage_permission",
+                          "the stage's port may not be opened: " + printable(stage.fault, 200),
+                          "sudo usermod -aG dialout $USER, then log in again");
   if (!stage.fault.empty())
     return findings.error("stage_fault", "the stage reports: " + printable(stage.fault, 200),
                           "mend the cause, then rosservice call " + stage.ns + "/recover");

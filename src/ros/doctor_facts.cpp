@@ -269,11 +269,9 @@ void judgeDriver(const std::map<std::string, Ears::Status>& statuses, DoctorFact
     images.link = value("link");
     images.counts["published"] = status.growth("frames published");
     images.counts["lost"] = status.growth("frames lost");
-    for (const auto& [key, last] : status.last) {
-      (void)last;
-      for (const char* part : {"incomplete", "underruns", "missing packets"})
-        if (key.find(part) != std::string::npos) images.counts[part] += status.growth(key);
-    }
+    images.counts["incomplete"] = status.growth("frames incomplete");
+    images.counts["underruns"] = status.growth("frames without memory");
+    images.counts["missing packets"] = status.growth("packets missing");
     return;
   }
 }
@@ -520,10 +518,16 @@ DoctorFacts gatherFacts(const DoctorOptions& options) {
     facts.stage.travel_seen = most - least;
     facts.stage.moving_share = moving / static_cast<double>(ears.stages.size());
   }
-  for (const std::string& prefix : {facts.stage.node, facts.stage.node + "/stage"})
-    if (ros::param::has(prefix + "/max_m"))
-      facts.stage.limits_apart =
-          parameterOr(prefix + "/max_m", 0.3) - parameterOr(prefix + "/min_m", 0.0);
+  // A stage node without its device says nothing but in its diagnostics.
+  for (const auto& [status_of, status] : ears.statuses) {
+    if ("/" + statusNode(status_of) != facts.stage.node || status.summary != "no stage") continue;
+    const auto problem = status.values.find("last problem");
+    facts.stage.fault =
+        "no stage" + (problem == status.values.end() ? std::string() : ": " + problem->second);
+  }
+  if (!facts.stage.node.empty() && ros::param::has(facts.stage.node + "/max_m"))
+    facts.stage.limits_apart = parameterOr(facts.stage.node + "/max_m", 0.3) -
+                               parameterOr(facts.stage.node + "/min_m", 0.0);
 
   if (!stereo.rig && !facts.images.empty() && ears.images[0].last) {
     const std::string camera = facts.images.front().frame_id;

@@ -129,6 +129,9 @@ const std::vector<Fault>& stageFaults() {
       {"dark_images", [](DoctorFacts& f) { f.images[0].mean_level = 0.003; }, "lens cap"},
       {"saturated_images", [](DoctorFacts& f) { f.images[0].saturated_fraction = 0.9; },
        "exposure_us"},
+      {"stage_permission",
+       [](DoctorFacts& f) { f.stage.fault = "no stage: /dev/ttyUSB0: Permission denied"; },
+       "dialout"},
       {"stage_fault", [](DoctorFacts& f) { f.stage.fault = "stalled"; }, "recover"},
       {"no_stage",
        [](DoctorFacts& f) {
