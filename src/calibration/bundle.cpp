@@ -10,6 +10,7 @@
 #include <cmath>
 #include <memory>
 
+#include "omnister/lens/lens_models.h"
 #include "pose_block.h"
 
 namespace omnister::calibration {
@@ -120,6 +121,220 @@ class Blocks : public ceres::EvaluationCallback {
  private:
   const BundleState& state_;
 };
+
+/// Weight of a grid's control points [px per rad], see adjust().
+constexpr double kGridWeight = 100.0;
+
+/// The normal equations of the whole problem: what is shared (lens parameters, warp, rig and axis,
+/// in that order, those that are free), and one pose each.
+class NormalEquations {
+ public:
+  NormalEquations(const std::vector<BundleView>& views, const BundleOptions& options,
+                  const BundleState& state)
+      : views_(views), options_(options) {
+    for (const LensPtr& lens : state.lenses) {
+      lens_column_.push_back(columns_);
+      if (options.lens) columns_ += static_cast<int>(lens->parameters().size());
+      const int side = structureOf(*lens).grid;
+      grid_size_.push_back(2 * side * side);
+    }
+    warp_column_ = columns_;
+    columns_ += options.warp ? 2 : 0;
+    rig_column_ = columns_;
+    columns_ += options.rig ? 6 : 0;
+    axis_column_ = columns_;
+    axis_steps_ = options.axis_length ? Eigen::MatrixXd(Eigen::Matrix3d::Identity())
+                                      : Eigen::MatrixXd(axisTangents(state.axis));
+    columns_ += options.axis ? static_cast<int>(axis_steps_.cols()) : 0;
+    poses_ = state.poses.size();
+  }
+
+  /// Sums up at `blocks`. @return the cost: the sum of the loss over all corners; infinite when a
+  /// lens is none
+  double build(const Blocks& blocks, double loss_px, bool derivatives) {
+    if (derivatives) {
+      shared = Eigen::MatrixXd::Zero(columns_, columns_);
+      gradient = Eigen::VectorXd::Zero(columns_);
+      pose.assign(poses_, Eigen::Matrix<double, 6, 6>::Zero());
+      pose_gradient.assign(poses_, Vector6d::Zero());
+      coupling.assign(poses_, Eigen::MatrixXd());
+    }
+    double cost = 0.0;
+    Linearization corner;
+    std::vector<int> active;
+    std::vector<Eigen::Vector2d> row;
+    for (const BundleView& view : views_) {
+      const LensPtr& lens = blocks.lenses[view.camera];
+      if (!lens) return HUGE_VAL;
+      const PoseValue* rig = view.camera == 1 ? &*blocks.rig_value : nullptr;
+      if (derivatives && coupling[view.pose].size() == 0) {
+        coupling[view.pose] = Eigen::MatrixXd::Zero(columns_, 6);
+      }
+      for (const Corner& c : *view.corners) {
+        linearize(*lens, blocks.poses[view.pose], rig, blocks.warp, view.travel * blocks.axis, c,
+                  derivatives, corner);
+        const double s = corner.residual.squaredNorm();
+        cost += loss_px > 0.0 ? loss_px * loss_px * std::log1p(s / (loss_px * loss_px)) : s;
+        if (!derivatives) continue;
+        active.clear();
+        row.clear();
+        const auto add = [&](int column, const Eigen::Vector2d& slope) {
+          // A grid has many control points, of which few matter to a corner.
+          if (slope.x() == 0.0 && slope.y() == 0.0) return;
+          active.push_back(column);
+          row.push_back(slope);
+        };
+        if (options_.lens) {
+          for (int k = 0; k < corner.d_lens.cols(); ++k) {
+            add(lens_column_[view.camera] + k, corner.d_lens.col(k));
+          }
+        }
+        if (options_.warp) {
+          add(warp_column_, corner.d_k1);
+          add(warp_column_ + 1, corner.d_k2);
+        }
+        if (options_.rig && rig) {
+          for (int k = 0; k < 6; ++k) add(rig_column_ + k, corner.d_rig.col(k));
+        }
+        if (options_.axis) {
+          for (int k = 0; k < axis_steps_.cols(); ++k) {
+            add(axis_column_ + k, -view.travel * corner.d_point * axis_steps_.col(k));
+          }
+        }
+        const double weight = cauchyWeight(s, loss_px);
+        Eigen::MatrixXd& couple = coupling[view.pose];
+        for (std::size_t a = 0; a < active.size(); ++a) {
+          const Eigen::Vector2d weighted = weight * row[a];
+          for (std::size_t b = 0; b <= a; ++b) shared(active[a], active[b]) += weighted.dot(row[b]);
+          gradient[active[a]] += weighted.dot(corner.residual);
+          couple.row(active[a]).noalias() += weighted.transpose() * corner.d_pose;
+        }
+        pose[view.pose].noalias() += weight * corner.d_pose.transpose() * corner.d_pose;
+        pose_gradient[view.pose].noalias() += weight * corner.d_pose.transpose() * corner.residual;
+      }
+    }
+    for (std::size_t i = 0; i < grid_size_.size(); ++i) {
+      if (!options_.lens || grid_size_[i] == 0) continue;
+      const Eigen::Index size = blocks.lens_blocks[i].size();
+      const auto points = blocks.lens_blocks[i].tail(grid_size_[i]);
+      cost += kGridWeight * kGridWeight * points.squaredNorm();
+      if (!derivatives) continue;
+      const Eigen::Index first = lens_column_[i] + size - grid_size_[i];
+      gradient.segment(first, grid_size_[i]) += kGridWeight * kGridWeight * points;
+      shared.diagonal().segment(first, grid_size_[i]).array() += kGridWeight * kGridWeight;
+    }
+    if (derivatives) shared = Eigen::MatrixXd(shared.selfadjointView<Eigen::Lower>());
+    return std::isfinite(cost) ? cost : HUGE_VAL;
+  }
+
+  /// Moves the blocks by the step that solves the equations with a damped diagonal.
+  /// @return false for equations without a solution
+  bool step(double damping, Blocks& blocks) const {
+    const auto damped = [&](auto matrix) {
+      const double least = 1e-12 * matrix.diagonal().maxCoeff();
+      matrix.diagonal() *= 1.0 + damping;
+      matrix.diagonal().array() += least;
+      return matrix;
+    };
+    Eigen::MatrixXd reduced = damped(shared);
+    Eigen::VectorXd right = -gradient;
+    std::vector<Eigen::LDLT<Eigen::Matrix<double, 6, 6>>> inverse(poses_);
+    for (std::size_t i = 0; i < poses_; ++i) {
+      if (coupling[i].size() == 0) continue;
+      inverse[i].compute(damped(pose[i]));
+      reduced.noalias() -= coupling[i] * inverse[i].solve(coupling[i].transpose());
+      right += coupling[i] * inverse[i].solve(pose_gradient[i]);
+    }
+    // Parameters differ by many orders of magnitude.
+    const Eigen::VectorXd scale = reduced.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+    const Eigen::MatrixXd scaled = scale.asDiagonal() * reduced * scale.asDiagonal();
+    const Eigen::VectorXd change =
+        scale.cwiseProduct(scaled.ldlt().solve(scale.cwiseProduct(right)));
+    if (!change.allFinite()) return false;
+    for (std::size_t i = 0; i < poses_; ++i) {
+      if (coupling[i].size() == 0) continue;
+      const Vector6d move =
+          -inverse[i].solve(Vector6d(pose_gradient[i] + coupling[i].transpose() * change));
+      if (!move.allFinite()) return false;
+      blocks.pose_blocks[i] += move;
+    }
+    if (options_.lens) {
+      for (std::size_t i = 0; i < lens_column_.size(); ++i) {
+        blocks.lens_blocks[i] += change.segment(lens_column_[i], blocks.lens_blocks[i].size());
+      }
+    }
+    if (options_.warp) blocks.warp += change.segment<2>(warp_column_);
+    if (options_.rig) blocks.rig += change.segment<6>(rig_column_);
+    if (options_.axis) {
+      const double length = blocks.axis.norm();
+      blocks.axis += axis_steps_ * change.segment(axis_column_, axis_steps_.cols());
+      if (!options_.axis_length) blocks.axis *= length / blocks.axis.norm();
+    }
+    blocks.prepare();
+    return true;
+  }
+
+  Eigen::MatrixXd shared;  ///< lower and upper
+  Eigen::VectorXd gradient;
+  std::vector<Eigen::Matrix<double, 6, 6>> pose;
+  std::vector<Vector6d> pose_gradient;
+  std::vector<Eigen::MatrixXd> coupling;  ///< empty for poses that no view has
+
+ private:
+  const std::vector<BundleView>& views_;
+  const BundleOptions& options_;
+  std::vector<int> lens_column_;
+  std::vector<int> grid_size_;
+  int warp_column_ = 0;
+  int rig_column_ = 0;
+  int axis_column_ = 0;
+  int columns_ = 0;
+  Eigen::MatrixXd axis_steps_;
+  std::size_t poses_ = 0;
+};
+
+/// Levenberg and Marquardt on the normal equations: for lenses with a grid, whose Jacobians are
+/// sparse within their one block.
+bool adjustByNormalEquations(const std::vector<BundleView>& views, const BundleOptions& options,
+                             BundleState& state) {
+  Blocks blocks(state);
+  NormalEquations equations(views, options, state);
+  double damping = 1e-4;
+  double cost = equations.build(blocks, options.loss_px, true);
+  if (!(cost < HUGE_VAL)) return false;
+  for (int iteration = 0; iteration < options.max_iterations; ++iteration) {
+    bool improved = false;
+    double change = 0.0;
+    const auto lens_before = blocks.lens_blocks;
+    const auto poses_before = blocks.pose_blocks;
+    const Eigen::Vector2d warp_before = blocks.warp;
+    const Vector6d rig_before = blocks.rig;
+    const Eigen::Vector3d axis_before = blocks.axis;
+    for (int attempt = 0; attempt < 12 && !improved; ++attempt) {
+      const double next = equations.step(damping, blocks)
+                              ? equations.build(blocks, options.loss_px, false)
+                              : HUGE_VAL;
+      if (next < cost) {
+        change = cost - next;
+        cost = next;
+        damping = std::max(0.1 * damping, 1e-12);
+        improved = true;
+        break;
+      }
+      damping *= 10.0;
+      blocks.lens_blocks = lens_before;
+      blocks.pose_blocks = poses_before;
+      blocks.warp = warp_before;
+      blocks.rig = rig_before;
+      blocks.axis = axis_before;
+      blocks.prepare();
+    }
+    if (!improved || change <= options.tolerance * cost) break;
+    equations.build(blocks, options.loss_px, true);
+  }
+  state = blocks.state();
+  return true;
+}
 
 /// All corners of a view in one residual block: Ceres' book-keeping then costs little beside the
 /// projections. The loss acts on each corner: the residual handed over is g(r) = r sqrt(rho(s) / s)
@@ -259,6 +474,11 @@ std::vector<Eigen::Vector2d> residualsOf(const BundleView& view, const BundleSta
 
 bool adjust(const std::vector<BundleView>& views, const BundleOptions& options,
             BundleState& state) {
+  for (const LensPtr& lens : state.lenses) {
+    if (options.lens && structureOf(*lens).grid > 0) {
+      return adjustByNormalEquations(views, options, state);
+    }
+  }
   Blocks blocks(state);
   ceres::Problem::Options problem_options;
   problem_options.evaluation_callback = &blocks;
@@ -402,56 +622,14 @@ Eigen::Matrix<double, 3, 2> axisTangents(const Eigen::Vector3d& axis) {
 
 Eigen::MatrixXd reducedInformation(const std::vector<BundleView>& views,
                                    const BundleOptions& options, const BundleState& state) {
-  // Columns: lens of each camera, warp, rig, axis.
-  std::vector<int> lens_column;
-  int columns = 0;
-  for (const LensPtr& lens : state.lenses) {
-    lens_column.push_back(columns);
-    if (options.lens) columns += static_cast<int>(lens->parameters().size());
-  }
-  const int warp_column = columns;
-  columns += options.warp ? 2 : 0;
-  const int rig_column = columns;
-  columns += options.rig ? 6 : 0;
-  const int axis_column = columns;
-  const Eigen::MatrixXd axis_steps = options.axis_length
-                                         ? Eigen::MatrixXd(Eigen::Matrix3d::Identity())
-                                         : Eigen::MatrixXd(axisTangents(state.axis));
-  columns += options.axis ? static_cast<int>(axis_steps.cols()) : 0;
-
   const Blocks blocks(state);
-  Eigen::MatrixXd information = Eigen::MatrixXd::Zero(columns, columns);
-  // Per pose, since several views may share one.
-  std::vector<Eigen::Matrix<double, 6, 6>> pose_information(state.poses.size(),
-                                                            Eigen::Matrix<double, 6, 6>::Zero());
-  std::vector<Eigen::MatrixXd> coupling(state.poses.size());
-  Linearization corner;
-  Eigen::MatrixXd row(2, columns);
-  for (const BundleView& view : views) {
-    Eigen::MatrixXd& couple = coupling[view.pose];
-    if (couple.size() == 0) couple = Eigen::MatrixXd::Zero(columns, 6);
-    const PoseValue* rig = view.camera == 1 ? &*blocks.rig_value : nullptr;
-    for (const Corner& c : *view.corners) {
-      linearize(*state.lenses[view.camera], blocks.poses[view.pose], rig, state.warp,
-                view.travel * state.axis, c, true, corner);
-      row.setZero();
-      if (options.lens) {
-        row.middleCols(lens_column[view.camera], corner.d_lens.cols()) = corner.d_lens;
-      }
-      if (options.warp) row.middleCols(warp_column, 2) << corner.d_k1, corner.d_k2;
-      if (options.rig && rig) row.middleCols(rig_column, 6) = corner.d_rig;
-      if (options.axis) {
-        row.middleCols(axis_column, axis_steps.cols()) = -view.travel * corner.d_point * axis_steps;
-      }
-      information.noalias() += row.transpose() * row;
-      couple.noalias() += row.transpose() * corner.d_pose;
-      pose_information[view.pose].noalias() += corner.d_pose.transpose() * corner.d_pose;
-    }
-  }
+  NormalEquations equations(views, options, state);
+  equations.build(blocks, 0.0, true);
+  Eigen::MatrixXd information = equations.shared;
   for (std::size_t i = 0; i < state.poses.size(); ++i) {
-    if (coupling[i].size() == 0) continue;
-    information.noalias() -=
-        coupling[i] * pose_information[i].ldlt().solve(coupling[i].transpose());
+    const Eigen::MatrixXd& coupling = equations.coupling[i];
+    if (coupling.size() == 0) continue;
+    information.noalias() -= coupling * equations.pose[i].ldlt().solve(coupling.transpose());
   }
   return 0.5 * (information + information.transpose());
 }

@@ -42,6 +42,9 @@ struct BundleOptions {
   double tolerance = 1e-10;  ///< relative change of cost at which to stop
 };
 
+/// A correction grid of a lens (LensStructure::grid) is held towards zero, a milliradian costing as
+/// much as a tenth of a pixel: that settles what it shares with the asphere below it and with the
+/// poses, and where no corner is.
 /// @return false when the adjustment failed (no finite cost, no usable step); `state` is then
 /// unchanged
 bool adjust(const std::vector<BundleView>& views, const BundleOptions& options, BundleState& state);

@@ -28,6 +28,8 @@ constexpr double kParsimony = 0.003;
 constexpr double kSamePx = 2e-5;
 /// With more corners than this, every structure is well determined and trying them all takes long.
 constexpr std::size_t kManyCorners = 8000;
+/// With fewer corners a grid of corrections only follows the noise.
+constexpr std::size_t kGridCorners = 3000;
 
 std::string fixed(double value, int digits) {
   char text[64];
@@ -216,8 +218,8 @@ struct Tried {
 
 bool sameStructure(const LensStructure& a, const LensStructure& b) {
   return a.model == b.model && a.affinity == b.affinity && a.decentring == b.decentring &&
-         (a.model != "asphere" || a.even_terms == b.even_terms) &&
-         (a.model != "spline" || a.knots == b.knots);
+         a.grid == b.grid && (a.model != "asphere" || a.even_terms == b.even_terms) &&
+         (a.model != "spline" || (a.grid > 0 ? a.even_terms == b.even_terms : a.knots == b.knots));
 }
 
 class StructureChoice {
@@ -360,6 +362,21 @@ Selection selectStructure(const FitInput& input, const Fit& first,
           }
         }
         choice.consider(last, start);
+        best = choice.best();
+      }
+      // What no radial surface can say, where there are corners enough to tell: a coarse grid of
+      // corrections first, and a finer one where that helps.
+      if (best != nullptr && model != "asphere" && input.cornerCount() >= kGridCorners) {
+        for (const int side : {6, 9}) {
+          LensStructure grid = best->structure;
+          const Fit start = best->fit;
+          if (grid.model != "asphere" && grid.grid == 0) grid.even_terms = 2;
+          grid.model = "spline";
+          grid.grid = side;
+          choice.consider({grid}, start);
+          best = choice.best();
+          if (best->structure.grid != side) break;
+        }
       }
     }
   }
@@ -684,7 +701,9 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
 
   // The next richer model tells what the chosen one cannot say.
   LensStructure richer = fit.structure;
-  if (richer.model == "spline") {
+  if (richer.grid > 0) {
+    richer.grid = std::min(12, richer.grid + 2);
+  } else if (richer.model == "spline") {
     richer.knots = std::min(32, richer.knots + 4);
   } else if (richer.model == "asphere") {
     richer.even_terms = richer.even_terms + 1;

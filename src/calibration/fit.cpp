@@ -145,7 +145,14 @@ std::string describeStructure(const LensStructure& structure) {
   if (structure.model == "asphere") {
     text += structure.even_terms == 0 ? "" : " r^" + std::to_string(2 + 2 * structure.even_terms);
   }
-  if (structure.model == "spline") text += " of " + std::to_string(structure.knots) + " knots";
+  if (structure.model == "spline" && structure.grid > 0) {
+    const std::string side = std::to_string(structure.grid);
+    text += ": asphere";
+    text += structure.even_terms == 0 ? "" : " r^" + std::to_string(2 + 2 * structure.even_terms);
+    text += " + " + side + "x" + side + " grid";
+  } else if (structure.model == "spline") {
+    text += " of " + std::to_string(structure.knots) + " knots";
+  }
   if (structure.affinity) text += " + affinity";
   if (structure.decentring) text += " + decentring";
   return text;
@@ -319,7 +326,11 @@ std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStruc
     bearings.push_back(bearing);
     pixels.push_back(*pixel);
   }
-  lens = fitLens(*lens, bearings, pixels).lens;
+  // A grid's control points start at zero: they are for what nothing else can say.
+  LensFitOptions base;
+  base.parameters =
+      static_cast<int>(lens->parameters().size()) - 2 * structure.grid * structure.grid;
+  lens = fitLens(*lens, bearings, pixels, base).lens;
   fit.state.lenses = {lens};
 
   const auto views = bundleViews(input);

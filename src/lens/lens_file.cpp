@@ -20,7 +20,8 @@ using namespace detail;
 
 constexpr int kVersion = 1;
 constexpr std::size_t kMaxBytes = 4u << 20;
-constexpr double kStandardBound = 1.0;  // [px]
+constexpr double kStandardBound = 1.0;        // [px]
+constexpr Eigen::Index kMostCovariance = 64;  // parameters
 
 // ---------------------------------------------------------------- reading
 
@@ -150,7 +151,7 @@ std::string formatLensFile(const LensFile& file) {
   out += "  max_theta: " + yamlNumber(lens.maxTheta()) + "\n";
   out += "  parameters:\n";
   for (const auto& [name, values] : namedParameters(lens)) {
-    const bool list = name == "radii";
+    const bool list = name == "radii" || name == "bend";
     out += "    " + name + ": " + (list ? yamlFlow(values) : yamlNumber(values.at(0))) + "\n";
   }
   if (file.covariance) {
@@ -160,7 +161,10 @@ std::string formatLensFile(const LensFile& file) {
       throw Error("the covariance of a " + std::string(lens.model()) + " lens needs " +
                   std::to_string(size) + " rows and columns of finite numbers");
     }
-    out += "  covariance: " + yamlRowMajor(*file.covariance) + "\n";
+    // The square of a grid's size would dwarf all else; what it says in sum stands in the notes.
+    if (size <= kMostCovariance) {
+      out += "  covariance: " + yamlRowMajor(*file.covariance) + "\n";
+    }
   }
   if (file.stage_axis) {
     out += "  stage_axis: " +

@@ -25,6 +25,10 @@ constexpr double kPi = 3.14159265358979323846;
 // A field reaches at most this far: the ray straight back has no azimuth.
 constexpr double kLargestField = kPi - 1e-3;
 constexpr double kMaxCenter = 1e7;  // [px]
+constexpr int kLeastGrid = 4;
+constexpr int kLargestGrid = 12;
+// The grid reaches a little beyond the field that is asked for.
+constexpr double kGridMargin = 1.06;
 // A ray at exactly maxTheta() is inside whatever its rounding.
 constexpr double kCosSlack = 1e-12;
 constexpr double kFieldSlack = 1e-8;  // [rad]
@@ -143,24 +147,123 @@ Eigen::Matrix2d planeOfAnglesJacobian(const Eigen::Vector2d& a) {
   return k * Eigen::Matrix2d::Identity() + (0.5 * (1.0 + m * m) - k) * e * e.transpose();
 }
 
+// A smooth shift of the angle vector: uniform cubic B-splines over the square [-span, span]^2, one
+// control point (a shift in radians) every 2 span / (n - 3). Outside the square the control points
+// go on as zeros, so that the shift fades away.
+class BendGrid {
+ public:
+  BendGrid() = default;
+  BendGrid(int side, double span)
+      : side_(side), span_(span), cell_(side > 3 ? 2.0 * span / (side - 3) : 1.0) {
+    points_.setZero(2, side * side);
+  }
+
+  int side() const { return side_; }
+  double span() const { return span_; }
+  int size() const { return 2 * side_ * side_; }
+  const Eigen::Matrix2Xd& points() const { return points_; }
+  void set(const double* values) {
+    points_ = Eigen::Map<const Eigen::Matrix2Xd>(values, 2, side_ * side_);
+  }
+
+  Eigen::Vector2d shift(const Eigen::Vector2d& a, Eigen::Matrix2d* d_a = nullptr) const {
+    Eigen::Vector2d out = Eigen::Vector2d::Zero();
+    if (d_a != nullptr) d_a->setZero();
+    visit(a, [&](int index, double weight, double d_x, double d_y) {
+      out += weight * points_.col(index);
+      if (d_a == nullptr) return;
+      d_a->col(0) += d_x * points_.col(index);
+      d_a->col(1) += d_y * points_.col(index);
+    });
+    return out;
+  }
+
+  /// Calls with the index of each control point that matters at `a`, its weight and the slopes of
+  /// that.
+  template <typename Visitor>
+  void visit(const Eigen::Vector2d& a, const Visitor& visitor) const {
+    const Axis x = axis(a.x());
+    const Axis y = axis(a.y());
+    for (int j = 0; j < 4; ++j) {
+      if (y.first + j < 0 || y.first + j >= side_) continue;
+      for (int i = 0; i < 4; ++i) {
+        if (x.first + i < 0 || x.first + i >= side_) continue;
+        visitor((y.first + j) * side_ + x.first + i, x.weight[i] * y.weight[j],
+                x.slope[i] * y.weight[j], x.weight[i] * y.slope[j]);
+      }
+    }
+  }
+
+  /// Bounds of the shift [rad] and of its change per radian: a spline lies within its control
+  /// points, and its slope within their differences.
+  Decentring::Bounds bounds() const {
+    Decentring::Bounds bounds{0.0, 0.0};
+    const auto at = [&](int i, int j) -> Eigen::Vector2d {
+      if (i < 0 || j < 0 || i >= side_ || j >= side_) return Eigen::Vector2d::Zero();
+      return points_.col(j * side_ + i);
+    };
+    double across = 0.0;
+    double down = 0.0;
+    for (int j = 0; j <= side_; ++j) {
+      for (int i = 0; i <= side_; ++i) {
+        bounds.shift = std::max(bounds.shift, at(i, j).norm());
+        across = std::max(across, (at(i, j) - at(i - 1, j)).norm());
+        down = std::max(down, (at(i, j) - at(i, j - 1)).norm());
+      }
+    }
+    bounds.steepness = std::hypot(across, down) / cell_;
+    return bounds;
+  }
+
+ private:
+  struct Axis {
+    int first;
+    std::array<double, 4> weight;
+    std::array<double, 4> slope;
+  };
+  Axis axis(double angle) const {
+    const double place = (angle + span_) / cell_;
+    const double cell = std::floor(place);
+    const double t = place - cell;
+    const double u = 1.0 - t;
+    Axis out;
+    out.first = static_cast<int>(cell);
+    out.weight = {u * u * u / 6.0, (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0,
+                  (4.0 - 6.0 * u * u + 3.0 * u * u * u) / 6.0, t * t * t / 6.0};
+    const double k = 0.5 / cell_;
+    out.slope = {-k * u * u, k * t * (3.0 * t - 4.0), k * u * (4.0 - 3.0 * u), k * t * t};
+    return out;
+  }
+
+  int side_ = 0;
+  double span_ = 1.0;
+  double cell_ = 1.0;  // [rad]
+  Eigen::Matrix2Xd points_;
+};
+
 struct Extras {
   bool affinity = false;
   bool turn = false;
   bool decentring = false;
   bool growth = false;
+  int grid = 0;
   int bends() const { return decentring ? (growth ? 4 : 2) : 0; }
-  int size() const { return (affinity ? 2 : 0) + (turn ? 1 : 0) + bends(); }
+  int gridSize() const { return 2 * grid * grid; }
+  int size() const { return (affinity ? 2 : 0) + (turn ? 1 : 0) + bends() + gridSize(); }
+  bool bent() const { return decentring || grid > 0; }
 };
 
 template <typename Surface>
 class CentralLens final : public LensModel {
  public:
-  CentralLens(const Surface& surface, Extras extras) : surface_(surface), extras_(extras) {}
+  CentralLens(const Surface& surface, Extras extras, double grid_span = 1.0)
+      : surface_(surface), extras_(extras), grid_(extras.grid, grid_span) {}
 
-  std::string_view model() const override { return Surface::kModel; }
+  std::string_view model() const override { return extras_.grid > 0 ? "spline" : Surface::kModel; }
   double maxTheta() const override { return max_theta_; }
   const Surface& surface() const { return surface_; }
   const Extras& extras() const { return extras_; }
+  const BendGrid& grid() const { return grid_; }
 
   std::optional<Eigen::Vector2d> project(const Eigen::Vector3d& bearing, Jacobian23* d_bearing,
                                          JacobianParams* d_parameters) const override {
@@ -181,13 +284,16 @@ class CentralLens final : public LensModel {
     Jacobian23 d_n;
     std::array<double, 2 * kMaxSize> d_surface;
     double* const d_p = d_parameters != nullptr ? d_surface.data() : nullptr;
-    if (!extras_.decentring) {
+    if (!extras_.bent()) {
       if (!surface_.project(n, xy, d_bearing != nullptr ? &d_n : nullptr, d_p)) {
         return std::nullopt;
       }
     } else {
       const Eigen::Vector2d m = toPlane(n);
-      const Eigen::Vector2d a_bent = toAngles(n) + decentring_.shift(m);
+      const Eigen::Vector2d a = toAngles(n);
+      Eigen::Vector2d a_bent = a + decentring_.shift(m);
+      Eigen::Matrix2d d_grid = Eigen::Matrix2d::Zero();
+      if (extras_.grid > 0) a_bent += grid_.shift(a, d_bearing != nullptr ? &d_grid : nullptr);
       const bool need_d_n = d_bearing != nullptr || d_parameters != nullptr;
       if (!surface_.project(fromAngles(a_bent), xy, need_d_n ? &d_n : nullptr, d_p)) {
         return std::nullopt;
@@ -196,11 +302,22 @@ class CentralLens final : public LensModel {
         const Eigen::Matrix2d d_a = d_n * fromAnglesJacobian(a_bent);
         if (d_parameters != nullptr) {
           d_parameters->resize(2, size());
-          d_parameters->rightCols(extras_.bends()) =
-              linear_ * d_a * decentring_.byParameters(m).leftCols(extras_.bends());
+          const Eigen::Matrix2d d_pixel = linear_ * d_a;
+          const int first = size() - extras_.bends() - extras_.gridSize();
+          d_parameters->middleCols(first, extras_.bends()) =
+              d_pixel * decentring_.byParameters(m).leftCols(extras_.bends());
+          if (extras_.grid > 0) {
+            const int first_point = size() - extras_.gridSize();
+            d_parameters->rightCols(extras_.gridSize()).setZero();
+            grid_.visit(a, [&](int index, double weight, double, double) {
+              d_parameters->template middleCols<2>(first_point + 2 * index) = weight * d_pixel;
+            });
+          }
         }
         if (d_bearing != nullptr) {
-          d_n = d_a * (toAnglesJacobian(n) + decentring_.jacobian(m) * toPlaneJacobian(n));
+          Jacobian23 d_bent = decentring_.jacobian(m) * toPlaneJacobian(n);
+          d_bent += (Eigen::Matrix2d::Identity() + d_grid) * toAnglesJacobian(n);
+          d_n = d_a * d_bent;
           d_n -= (d_n * n) * n.transpose();
         }
       }
@@ -226,7 +343,7 @@ class CentralLens final : public LensModel {
     Eigen::Vector3d n;
     Jacobian32 d_xy;
     if (!surface_.unproject(xy, n, d_pixel != nullptr ? &d_xy : nullptr)) return std::nullopt;
-    if (extras_.decentring) {
+    if (extras_.bent()) {
       if (!(1.0 + n.z() > 1e-12)) return std::nullopt;
       const auto a = straighten(toAngles(n));
       if (!a) return std::nullopt;
@@ -264,6 +381,8 @@ class CentralLens final : public LensModel {
       out[i++] = decentring_.d3;
       out[i++] = decentring_.d4;
     }
+    out.tail(extras_.gridSize()) =
+        Eigen::Map<const Eigen::VectorXd>(grid_.points().data(), extras_.gridSize());
     return out;
   }
 
@@ -274,6 +393,7 @@ class CentralLens final : public LensModel {
     if (extras_.turn) out.push_back("s");
     if (extras_.decentring) out.insert(out.end(), {"d1", "d2"});
     if (extras_.growth) out.insert(out.end(), {"d3", "d4"});
+    for (int i = 0; i < extras_.gridSize(); ++i) out.push_back("bend" + std::to_string(i));
     return out;
   }
 
@@ -287,7 +407,7 @@ class CentralLens final : public LensModel {
     if (!(field > 0.0) || !(field <= kLargestField) || !parameters.allFinite()) return nullptr;
     if (!(parameters.head<2>().cwiseAbs().maxCoeff() <= kMaxCenter)) return nullptr;
 
-    auto out = std::make_shared<CentralLens>(surface_, extras_);
+    auto out = std::make_shared<CentralLens>(surface_, extras_, grid_.span());
     out->center_ = parameters.head<2>();
     int i = 2 + surface_.size();
     if (extras_.affinity) {
@@ -304,14 +424,24 @@ class CentralLens final : public LensModel {
       out->inverse_linear_ /= determinant;
     }
     double bent_field = field;
-    if (extras_.decentring) {
-      const auto d = parameters.tail(extras_.bends());
-      out->decentring_.e = {d[1], d[0]};
-      if (extras_.growth) {
-        out->decentring_.d3 = d[2];
-        out->decentring_.d4 = d[3];
+    if (extras_.bent()) {
+      Decentring::Bounds bounds{0.0, 0.0};
+      if (extras_.decentring) {
+        const auto d =
+            parameters.segment(size() - extras_.gridSize() - extras_.bends(), extras_.bends());
+        out->decentring_.e = {d[1], d[0]};
+        if (extras_.growth) {
+          out->decentring_.d3 = d[2];
+          out->decentring_.d4 = d[3];
+        }
+        bounds = out->decentring_.bounds(std::tan(0.5 * field));
       }
-      const Decentring::Bounds bounds = out->decentring_.bounds(std::tan(0.5 * field));
+      if (extras_.grid > 0) {
+        out->grid_.set(parameters.data() + size() - extras_.gridSize());
+        const Decentring::Bounds more = out->grid_.bounds();
+        bounds.shift += more.shift;
+        bounds.steepness += more.steepness;
+      }
       if (!(bounds.steepness < 0.95)) return nullptr;
       bent_field = std::min(field + bounds.shift, kLargestField);
     }
@@ -324,14 +454,24 @@ class CentralLens final : public LensModel {
   }
 
  private:
-  static constexpr int kMaxSize = 40;
+  static constexpr int kMaxSize = 40;  // of the surface
 
   int size() const { return 2 + surface_.size() + extras_.size(); }
 
+  // T and the grid's shift.
+  Eigen::Vector2d shiftOf(const Eigen::Vector2d& a) const {
+    Eigen::Vector2d out = decentring_.shift(planeOfAngles(a));
+    if (extras_.grid > 0) out += grid_.shift(a);
+    return out;
+  }
+
   // d(a + T)/da
   Eigen::Matrix2d bentJacobian(const Eigen::Vector2d& a) const {
-    return Eigen::Matrix2d::Identity() +
-           decentring_.jacobian(planeOfAngles(a)) * planeOfAnglesJacobian(a);
+    Eigen::Matrix2d out = Eigen::Matrix2d::Zero();
+    if (extras_.grid > 0) grid_.shift(a, &out);
+    out += decentring_.jacobian(planeOfAngles(a)) * planeOfAnglesJacobian(a);
+    out.diagonal().array() += 1.0;
+    return out;
   }
 
   // The inverse of a + T(m(a)), by Newton with halved steps: within the field the solution is the
@@ -343,10 +483,10 @@ class CentralLens final : public LensModel {
       return length <= border ? a : Eigen::Vector2d(a * (border / length));
     };
     const auto errorOf = [&](const Eigen::Vector2d& a) -> Eigen::Vector2d {
-      return a + decentring_.shift(planeOfAngles(a)) - bent;
+      return a + shiftOf(a) - bent;
     };
     Eigen::Vector2d a = inside(bent);
-    a = inside(bent - decentring_.shift(planeOfAngles(a)));
+    a = inside(bent - shiftOf(a));
     Eigen::Vector2d error = errorOf(a);
     for (int i = 0; i < 50; ++i) {
       const double size = error.norm();
@@ -373,6 +513,7 @@ class CentralLens final : public LensModel {
 
   Surface surface_;
   Extras extras_;
+  BendGrid grid_;
   Eigen::Vector2d center_ = Eigen::Vector2d::Zero();
   Eigen::Matrix2d linear_ = Eigen::Matrix2d::Identity();  // sensor coordinates to pixel
   Eigen::Matrix2d inverse_linear_ = Eigen::Matrix2d::Identity();
@@ -397,7 +538,24 @@ std::string known() {
 // A lens of the structure that carries no numbers yet.
 LensPtr prototype(const LensStructure& structure, double span) {
   const Extras extras{structure.affinity, structure.turn, structure.decentring,
-                      structure.decentring_growth};
+                      structure.decentring_growth, structure.grid};
+  if (structure.grid != 0) {
+    if (structure.model != "spline") {
+      throw Error("lens model " + printable(structure.model) +
+                  " cannot carry a grid of corrections, expected spline");
+    }
+    if (structure.grid < kLeastGrid || structure.grid > kLargestGrid) {
+      throw Error("a grid of " + std::to_string(structure.grid) +
+                  " control points a side, expected " + std::to_string(kLeastGrid) + " to " +
+                  std::to_string(kLargestGrid));
+    }
+    if (structure.even_terms < 0 || structure.even_terms > AsphereProfile::kMaxTerms) {
+      throw Error("an asphere with " + std::to_string(structure.even_terms) +
+                  " even terms, expected 0 to 3");
+    }
+    return std::make_shared<AsphereLens>(
+        RadialSurface<AsphereProfile>(AsphereProfile(structure.even_terms)), extras, span);
+  }
   if (structure.turn && !structure.affinity) {
     throw Error("a lens with a turn (s) but no affinity, expected both");
   }
@@ -449,7 +607,8 @@ LensPtr makeLens(const LensStructure& structure, const Eigen::Vector2d& center, 
                 formatNumber(center.x()) + ", " + formatNumber(center.y()) +
                 "), expected a positive length and finite numbers");
   }
-  const LensPtr bare = prototype(structure, max_theta);
+  const LensPtr bare =
+      prototype(structure, structure.grid > 0 ? kGridMargin * max_theta : max_theta);
   double field = max_theta;
   if (structure.model == "spherical") field = std::min(field, SphericalProfile::kMaxTheta);
 
@@ -464,12 +623,12 @@ LensPtr makeLens(const LensStructure& structure, const Eigen::Vector2d& center, 
     size = 3;
     parameters[2] = focal_px;
     parameters[3] = parameters[4] = 2.0 * std::sqrt(focal_px);
-  } else if (structure.model == "spline") {
+  } else if (structure.model == "spline" && structure.grid == 0) {
     for (int i = 1; i <= structure.knots; ++i) {
       parameters[1 + i] = focal_px * max_theta * i / structure.knots;
     }
   } else {
-    size = 3 + (structure.model == "asphere" ? structure.even_terms : 0);
+    size = 3 + (structure.model == "conic" ? 0 : structure.even_terms);
     parameters.segment<3>(2) << focal_px, 0.5, 1.0;
   }
   LensPtr lens = bare->withParameters(parameters, field);
@@ -517,6 +676,8 @@ LensStructure structureOf(const LensModel& lens) {
   } else if (const auto* asphere = dynamic_cast<const AsphereLens*>(&lens)) {
     extras(asphere->extras());
     out.even_terms = asphere->surface().terms();
+    out.grid = asphere->extras().grid;
+    if (out.grid > 0) out.model = "spline";
   } else if (const auto* spline = dynamic_cast<const SplineLens*>(&lens)) {
     extras(spline->extras());
     out.knots = spline->surface().size();
@@ -535,7 +696,15 @@ NamedParameters namedParameters(const LensModel& lens) {
     out.emplace_back("radii", std::vector<double>(values.data() + 2, values.data() + 2 + n));
     i += n;
   }
-  for (; i < names.size(); ++i) out.emplace_back(names[i], std::vector<double>{values[i]});
+  std::size_t end = names.size();
+  const auto* bent = dynamic_cast<const AsphereLens*>(&lens);
+  if (bent != nullptr) end -= static_cast<std::size_t>(bent->extras().gridSize());
+  for (; i < end; ++i) out.emplace_back(names[i], std::vector<double>{values[i]});
+  if (end < names.size()) {
+    out.emplace_back("bend_span", std::vector<double>{bent->grid().span()});
+    out.emplace_back("bend",
+                     std::vector<double>(values.data() + end, values.data() + names.size()));
+  }
   return out;
 }
 
@@ -563,6 +732,7 @@ LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
   if (given("a4")) structure.even_terms = 1;
   if (given("a6")) structure.even_terms = 2;
   if (given("a8")) structure.even_terms = 3;
+  const bool bent = model == "spline" && (given("bend") || given("bend_span"));
   const auto number = [&](const std::string& name, std::optional<double> fallback) {
     const auto found = parameters.find(name);
     if (found == parameters.end()) {
@@ -579,7 +749,28 @@ LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
   };
   double span = max_theta;
   std::vector<double> radii;
-  if (model == "spline") {
+  std::vector<double> bend;
+  if (bent) {
+    const auto found = parameters.find("bend");
+    if (found == parameters.end()) {
+      throw InputError(source, place + ".bend", "is missing, but bend_span is given");
+    }
+    bend = found->second;
+    for (int side = kLeastGrid; side <= kLargestGrid; ++side) {
+      if (bend.size() == static_cast<std::size_t>(2 * side * side)) structure.grid = side;
+    }
+    if (structure.grid == 0) {
+      throw InputError(source, place + ".bend",
+                       "has " + std::to_string(bend.size()) +
+                           " numbers, expected 2 n^2 with n from 4 to 12: a shift in x and y for "
+                           "each point of a square grid");
+    }
+    span = number("bend_span", std::nullopt);
+    if (!(span > 0.0) || !(span <= 2.0 * kLargestField)) {
+      throw InputError(source, place + ".bend_span",
+                       "is " + formatNumber(span) + ", expected radians in (0, 2 pi)");
+    }
+  } else if (model == "spline") {
     const auto found = parameters.find("radii");
     if (found == parameters.end()) {
       throw InputError(source, place + ".radii", "is missing, a spline surface needs it");
@@ -599,10 +790,11 @@ LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
   const LensPtr bare = prototype(structure, span);
   const std::vector<std::string> names = bare->parameterNames();
   for (const auto& [name, values] : parameters) {
-    const bool known_name = model == "spline" && (name == "radii" || name == "span")
-                                ? true
-                                : std::find(names.begin() + 2, names.end(), name) != names.end() &&
-                                      (model != "spline" || name[0] != 'r');
+    const bool list = bent ? name == "bend" || name == "bend_span"
+                           : model == "spline" && (name == "radii" || name == "span");
+    const bool known_name =
+        list || (std::find(names.begin() + 2, names.end(), name) != names.end() &&
+                 (model != "spline" || name[0] != (bent ? 'b' : 'r') || name == "beta"));
     if (!known_name) {
       throw InputError(source, place + "." + name,
                        "is no parameter of a " + structure.model + " surface");
@@ -629,6 +821,10 @@ LensPtr makeLens(std::string_view model, const Eigen::Vector2d& center,
   for (std::size_t i = 2; i < names.size(); ++i) {
     if (i - 2 < radii.size()) {
       values[i] = radii[i - 2];
+      continue;
+    }
+    if (i + bend.size() >= names.size()) {
+      values[i] = bend[i + bend.size() - names.size()];
       continue;
     }
     const bool neutral = names[i] == "p" || names[i] == "q" || names[i] == "s" ||

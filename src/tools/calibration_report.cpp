@@ -28,7 +28,13 @@ std::string structureText(const LensStructure& structure) {
   if (structure.model == "asphere" && structure.even_terms > 0) {
     text += " r^" + std::to_string(2 + 2 * structure.even_terms);
   }
-  if (structure.model == "spline") text += ", " + std::to_string(structure.knots) + " knots";
+  if (structure.grid > 0) {
+    const std::string side = std::to_string(structure.grid);
+    text += ": asphere";
+    if (structure.even_terms > 0) text += " r^" + std::to_string(2 + 2 * structure.even_terms);
+    text += " + " + side + "x" + side + " grid";
+  } else if (structure.model == "spline")
+    text += ", " + std::to_string(structure.knots) + " knots";
   if (structure.affinity) text += " + affinity";
   if (structure.decentring) text += " + decentring";
   return text;
@@ -74,6 +80,7 @@ std::string calibrationReport(const std::string& title, const Detections& detect
   const auto names = lens.parameterNames();
   const Eigen::VectorXd values = lens.parameters();
   for (std::size_t i = 0; i < names.size(); ++i) {
+    if (names[i].rfind("bend", 0) == 0) continue;  // a grid has hundreds
     const auto k = static_cast<Eigen::Index>(i);
     std::string value = fixed(values[k], 6);
     if (result.file.covariance)

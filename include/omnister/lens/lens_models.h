@@ -19,8 +19,8 @@ const std::vector<std::string>& lensModelNames();
 /// What a model carries beyond its name.
 struct LensStructure {
   std::string model = "conic";
-  int even_terms = 0;       ///< asphere: how many of r^4, r^6, r^8 (0 to 3)
-  int knots = 12;           ///< spline: knots spaced evenly in angle (4 to 32)
+  int even_terms = 0;       ///< asphere, or spline with a grid: how many of r^4, r^6, r^8 (0 to 3)
+  int knots = 12;           ///< spline without a grid: knots spaced evenly in angle (4 to 32)
   bool affinity = false;    ///< p and q
   bool decentring = false;  ///< asphere and spline only: d1 and d2
   /// d3 and d4 as well: decentring that grows otherwise than Brown's with the angle.
@@ -28,6 +28,9 @@ struct LensStructure {
   /// s as well: a foreign camera may be turned about its axis against its own image. Never in a
   /// calibration from boards, whose poses would turn along.
   bool turn = false;
+  /// Spline: control points a side (4 to 12) of a smooth 2-D correction of an asphere's rays; 0: the
+  /// radial spline.
+  int grid = 0;
 };
 
 /// A lens of the structure that is nearest to the equidistant fisheye r = f theta: the starting

@@ -206,6 +206,43 @@ TEST(Calibrate, AutoChoosesByHeldOutErrorAndSaysSo) {
   EXPECT_LT(compare(*truth, *result.file.lens, 92 * kDegree).rms, 0.1);
 }
 
+TEST(Calibrate, AGridSaysWhatNoRadialSurfaceCan) {
+  LensStructure structure;
+  structure.model = "spline";
+  structure.even_terms = 1;
+  structure.grid = 6;
+  const LensPtr plain = makeLens(structure, {645.3, 473.1}, 285.0, 95 * kDegree);
+  Eigen::VectorXd numbers = plain->parameters();
+  std::mt19937 random(3);
+  std::uniform_real_distribution<double> unit(-0.004, 0.004);
+  for (double& value : numbers.tail(72)) value = unit(random);
+  const LensPtr truth = plain->withParameters(numbers);
+  ASSERT_NE(truth, nullptr);
+  BoardScene scene = wideScene(5, 0.1);
+  scene.views = 44;
+  scene.cols = scene.rows = 10;
+  scene.square = 0.02;
+  const Detections detections = test::simulatedBoards(*truth, scene);
+  const CalibrationResult result = calibrate(detections, {});
+  EXPECT_GT(result.points, 3000);
+  EXPECT_GT(structureOf(*result.file.lens).grid, 0);
+  const ProjectionField error =
+      projectionDifference(*truth, *result.file.lens, detections.image_size);
+  EXPECT_LT(error.rms_px, 0.05);
+  EXPECT_LT(error.max_px, 0.25);
+  EXPECT_NEAR(result.rms_px, 0.14, 0.01);
+  CalibrationOptions radial;
+  radial.model = "asphere";
+  const CalibrationResult without = calibrate(detections, radial);
+  EXPECT_GT(projectionDifference(*truth, *without.file.lens, detections.image_size).rms_px, 0.15);
+
+  // Into a lens file and back; the square of the grid's size is left out.
+  const LensFile file = parseLensFile(formatLensFile(result.file), "grid.yaml");
+  EXPECT_EQ(file.lens->parameters(), result.file.lens->parameters());
+  EXPECT_FALSE(file.covariance);
+  EXPECT_TRUE(file.calibration.notes.count("uncertainty_rms_px"));
+}
+
 TEST(Calibrate, SameNumbersWithAnyNumberOfThreads) {
   const LensPtr truth = wideLens();
   BoardScene scene = wideScene(13, 0.1);
