@@ -127,6 +127,7 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   result.matching.max_range = parameters.number("max_range", 50.0, 1e-3, 1e4, "m");
   result.matching.hypotheses = parameters.integer("hypotheses", 0, 0, 4096);
   result.matching.threads = parameters.integer("threads", 0, 0, 256);
+  result.matching.refine = parameters.flag("refine", false);
   const double rate = parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)");
   result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
   result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});

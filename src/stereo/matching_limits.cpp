@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <opencv2/core.hpp>
 #include <string>
 
 #include "omnister/common/error.h"
@@ -141,6 +142,13 @@ MatchingLimits checkMatching(const StereoGeometry& geometry, const MatcherOption
                 " like the reference image");
   }
 
+  if (!options.prior.empty() &&
+      (options.prior.type() != CV_32FC1 || options.prior.size() != geometry.reference_size)) {
+    throw Error("prior range is " + sizeText(options.prior.size()) +
+                ", expected one 32-bit float channel of " + sizeText(geometry.reference_size) +
+                " like the reference image");
+  }
+
   limits.longest_path_px =
       longestPath(geometry, limits.minInverseRange(), limits.maxInverseRange());
   if (limits.longest_path_px < 0.0) {
@@ -186,6 +194,36 @@ void checkImages(const StereoGeometry& geometry, const cv::Mat& reference,
   for (std::size_t i = 0; i < displaced.size(); ++i) {
     check(displaced[i], geometry.displaced[i].size, "image of " + displacedName(i));
   }
+}
+
+std::vector<std::string> imageRemarks(const cv::Mat& reference,
+                                      const std::vector<cv::Mat>& displaced) {
+  std::vector<std::string> remarks;
+  double reference_mean = 0.0;
+  for (std::size_t i = 0; i <= displaced.size(); ++i) {
+    const cv::Mat& image = i == 0 ? reference : displaced[i - 1];
+    const std::string whose =
+        i == 0 ? "the reference image" : "displaced image " + std::to_string(i);
+    cv::Scalar mean, spread;
+    cv::meanStdDev(image, mean, spread);
+    const double saturated =
+        static_cast<double>(cv::countNonZero(image == 255)) / static_cast<double>(image.total());
+    if (mean[0] < 2.0) {
+      remarks.push_back(whose + " is black");
+    } else if (saturated > 0.5) {
+      remarks.push_back(whose + " is saturated: " + formatNumber(std::round(100.0 * saturated)) +
+                        " % of it");
+    } else if (spread[0] < 1.0) {
+      remarks.push_back(whose + " has no contrast");
+    } else if (i > 0 && reference_mean >= 2.0 &&
+               (mean[0] > 3.0 * reference_mean || 3.0 * mean[0] < reference_mean)) {
+      remarks.push_back(whose + " is exposed otherwise than the reference: mean grey level " +
+                        formatNumber(std::round(mean[0])) + " to " +
+                        formatNumber(std::round(reference_mean)));
+    }
+    if (i == 0) reference_mean = mean[0];
+  }
+  return remarks;
 }
 
 }  // namespace omnister

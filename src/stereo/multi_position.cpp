@@ -19,6 +19,9 @@ namespace {
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr float kAgree = 4.0f;  ///< standard deviations that two estimates of one point may differ
 
+constexpr float kPriorSpread = 0.05f;  ///< of a prior range, relative
+constexpr float kPriorScore = 0.1f;
+
 }  // namespace
 
 RangeFusion::RangeFusion(cv::Size size, int threads) : threads_(threads) {
@@ -87,6 +90,29 @@ void RangeFusion::add(const MatchResult& pair) {
       8);
 }
 
+void RangeFusion::addPrior(const cv::Mat& range) {
+  parallelFor(
+      0, static_cast<std::size_t>(inverse.rows), threads_,
+      [&](std::size_t row) {
+        const int y = static_cast<int>(row);
+        for (int x = 0; x < inverse.cols; ++x) {
+          const float known = range.at<float>(y, x);
+          if (!(known > 0) || std::isinf(known)) continue;
+          std::uint8_t& n = support.at<std::uint8_t>(y, x);
+          float& w = inverse.at<float>(y, x);
+          if (n == 0) {
+            w = 1 / known;
+            weight.at<float>(y, x) = known * known / (kPriorSpread * kPriorSpread);
+            score.at<float>(y, x) = kPriorScore;
+            n = 1;
+          } else if (std::fabs(w * known - 1) < kPriorSpread && n < 255) {
+            ++n;
+          }
+        }
+      },
+      8);
+}
+
 void concludeRange(const cv::Mat& inverse, const cv::Mat& weight, const cv::Mat& score,
                    const MatcherOptions& options, MatchResult* out) {
   const cv::Size size = inverse.size();
@@ -128,6 +154,7 @@ class MultiPositionMatcher : public Matcher {
         options_(options),
         fusion_(geometry.reference_size, options.threads),
         refinement_(geometry, options.threads) {
+    options_.prior = options.prior.clone();
     // From the shortest baseline on: what is near and hidden from far positions is known first.
     order_.resize(geometry.displaced.size());
     std::iota(order_.begin(), order_.end(), std::size_t{0});
@@ -159,6 +186,7 @@ class MultiPositionMatcher : public Matcher {
       for (const auto& [name, count] : pair.statistics.rejected) statistics.rejected[name] += count;
       fusion_.add(pair);
     }
+    if (!options_.prior.empty()) fusion_.addPrior(options_.prior);
     const auto fused = std::chrono::steady_clock::now();
     statistics.rejected["not confirmed"] = refinement_.refine(reference, displaced, fusion_.support,
                                                               &fusion_.inverse, &fusion_.weight);

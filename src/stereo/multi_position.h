@@ -20,6 +20,9 @@ class RangeFusion {
   void clear();
   /// @param pair range, sigma and score of one position
   void add(const MatchResult& pair);
+  /// What was known before, where nothing was found; where it agrees it supports what was found.
+  /// @param range CV_32FC1 [m], NaN where unknown
+  void addPrior(const cv::Mat& range);
   int count() const { return count_; }  ///< positions since clear()
 
   cv::Mat inverse;  ///< CV_32FC1, 1 / range [1/m]; NaN where unknown

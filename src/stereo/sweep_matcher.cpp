@@ -978,7 +978,13 @@ std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
                                           const MatcherOptions& options) {
   checkMatching(geometry, options);
   sweep::holdSimdByEnvironment();
-  if (geometry.displaced.size() > 1 || options.refine)
+  // What a pair takes for each pixel, and the descriptors of each displaced image.
+  const double pixels = geometry.reference_size.area();
+  double bytes = 60 * pixels;
+  for (const auto& displaced : geometry.displaced)
+    bytes += 20 * std::max(pixels, static_cast<double>(displaced.size.area()));
+  checkMemory(bytes, "the sweep");
+  if (geometry.displaced.size() > 1 || options.refine || !options.prior.empty())
     return makeMultiPositionMatcher(geometry, options);
   return std::make_unique<SweepMatcher>(geometry, options);
 }

@@ -7,18 +7,22 @@
 #include <cmath>
 #include <cstring>
 #include <fstream>
+#include <iostream>
 #include <map>
 #include <memory>
 #include <opencv2/core/utility.hpp>
 #include <opencv2/imgproc.hpp>
+#include <sstream>
 #include <string>
 #include <vector>
 
 #include "commands.h"
 #include "omnister/common/error.h"
 #include "omnister/common/image_file.h"
+#include "omnister/common/numbers.h"
 #include "omnister/common/parallel.h"
 #include "omnister/lens/lens_file.h"
+#include "omnister/lens/reduced_lens.h"
 #include "omnister/stereo/cloud.h"
 #include "omnister/stereo/matcher.h"
 #include "omnister/stereo/matching_limits.h"
@@ -41,6 +45,9 @@ struct StereoArguments {
   std::vector<std::string> displaced;
   std::vector<std::string> poses;
   std::string mask;
+  std::string prior;
+  std::string roi;
+  int reduce = 1;
   std::string matcher = "sweep";
   std::string thesis_mask = "fig5.5";
   int thesis_window = 11;
@@ -132,10 +139,50 @@ cv::Mat greyOf(const cv::Mat& image) {
 void checkFiles(const StereoArguments& arguments) {
   if (!arguments.cloud.empty()) checkCloudPath(arguments.cloud);
   if (!arguments.range.empty()) checkRangePath(arguments.range);
-  std::vector<std::string> inputs = {arguments.lens, arguments.reference, arguments.mask};
+  std::vector<std::string> inputs = {arguments.lens, arguments.reference, arguments.mask,
+                                     arguments.prior};
   inputs.insert(inputs.end(), arguments.lens_displaced.begin(), arguments.lens_displaced.end());
   inputs.insert(inputs.end(), arguments.displaced.begin(), arguments.displaced.end());
   checkOutputs(inputs, {arguments.cloud, arguments.range});
+}
+
+// Means over squares of pixels; what is left over at the right and below is cut off.
+cv::Mat reduced(const cv::Mat& image, int factor) {
+  if (factor == 1) return image;
+  cv::Mat small;
+  const cv::Size size = image.size() / factor;
+  cv::resize(image(cv::Rect(cv::Point(), size * factor)), small, size, 0, 0, cv::INTER_AREA);
+  return small;
+}
+
+// "x,y,width,height" inside an image.
+cv::Rect parseRegion(const std::string& text, cv::Size size) {
+  std::vector<double> numbers;
+  std::istringstream stream(text);
+  std::string field;
+  while (std::getline(stream, field, ',')) {
+    const auto number = parseNumber(field);
+    if (!number || *number != std::floor(*number) || std::abs(*number) > 1e6) break;
+    numbers.push_back(*number);
+  }
+  if (numbers.size() == 4 && stream.eof() && numbers[0] >= 0 && numbers[1] >= 0 &&
+      numbers[2] >= 1 && numbers[3] >= 1 && numbers[0] + numbers[2] <= size.width &&
+      numbers[1] + numbers[3] <= size.height) {
+    return {static_cast<int>(numbers[0]), static_cast<int>(numbers[1]),
+            static_cast<int>(numbers[2]), static_cast<int>(numbers[3])};
+  }
+  throw Error("--roi is '" + printable(text) + "', expected x,y,width,height inside the " +
+              sizeText(size) + " reference image");
+}
+
+cv::Mat readPrior(const std::string& path, cv::Size size) {
+  const cv::Mat prior = readImage(path);
+  if (prior.type() != CV_32FC1 || prior.size() != size) {
+    throw InputError(path, "",
+                     "is not a range image (32-bit float, one channel) of " + sizeText(size) +
+                         ", the size of the cloud");
+  }
+  return prior;
 }
 
 struct Inputs {
@@ -144,6 +191,28 @@ struct Inputs {
   cv::Mat color;                   // CV_8UC1 or CV_8UC3, for the cloud
   std::vector<cv::Mat> displaced;  // CV_8UC1
 };
+
+// Everything in a smaller image, with the lens of that image.
+void reduceInputs(StereoArguments& arguments, Inputs* inputs) {
+  const int factor = arguments.reduce;
+  StereoGeometry& geometry = inputs->geometry;
+  const auto shrink = [&](LensPtr& lens, cv::Size& size, const char* whose) {
+    lens = reducedLens(lens, factor);
+    size = size / factor;
+    if (size.width < 16 || size.height < 16) {
+      throw Error(std::string("reduced ") + std::to_string(factor) + " times the " + whose +
+                  " image would be " + sizeText(size) + ", expected 16x16 or more");
+    }
+  };
+  shrink(geometry.reference_lens, geometry.reference_size, "reference");
+  for (auto& displaced : geometry.displaced) shrink(displaced.lens, displaced.size, "displaced");
+  inputs->reference = reduced(inputs->reference, factor);
+  inputs->color = reduced(inputs->color, factor);
+  for (cv::Mat& image : inputs->displaced) image = reduced(image, factor);
+  cv::Mat& mask = arguments.options.mask;
+  // A reduced pixel is left out if any part of it is.
+  if (!mask.empty()) mask = reduced(mask, factor) == 255;
+}
 
 Inputs readInputs(StereoArguments& arguments) {
   const std::size_t count = arguments.displaced.size();
@@ -198,6 +267,15 @@ Inputs readInputs(StereoArguments& arguments) {
     }
     arguments.options.mask = mask != 0;
   }
+  if (!arguments.roi.empty()) {
+    cv::Mat region(lens.image_size, CV_8UC1, cv::Scalar(0));
+    region(parseRegion(arguments.roi, lens.image_size)).setTo(255);
+    if (!arguments.options.mask.empty()) region &= arguments.options.mask;
+    arguments.options.mask = region;
+  }
+  if (arguments.reduce > 1) reduceInputs(arguments, &inputs);
+  if (!arguments.prior.empty())
+    arguments.options.prior = readPrior(arguments.prior, inputs.geometry.reference_size);
   return inputs;
 }
 
@@ -223,6 +301,13 @@ void runStereo(StereoArguments& arguments, bool json) {
   cv::setNumThreads(threadCount(std::clamp(arguments.options.threads, 0, kMaxThreads)));
 
   auto start = Clock::now();
+  if (arguments.matcher == "thesis" && (arguments.options.refine || !arguments.prior.empty())) {
+    throw Error(std::string(arguments.options.refine ? "--refine" : "--prior") +
+                " is for the sweep, not for the thesis' matcher");
+  }
+  if (arguments.reduce < 1 || arguments.reduce > 64) {
+    throw Error("--reduce is " + std::to_string(arguments.reduce) + ", expected 1 to 64");
+  }
   const Inputs inputs = readInputs(arguments);
   const double read_seconds = secondsSince(start);
   // Fails here with a clear message rather than in the matcher.
@@ -278,6 +363,18 @@ void runStereo(StereoArguments& arguments, bool json) {
   result["valid_fraction"] =
       field > 0 ? static_cast<double>(match.statistics.valid) / static_cast<double>(field) : 0.0;
   for (const auto& [reason, count] : match.statistics.rejected) result["rejected"][reason] = count;
+  // Of images that give little: why.
+  const std::vector<std::string> remarks = imageRemarks(inputs.reference, inputs.displaced);
+  for (const std::string& remark : remarks) {
+    result["remarks"].push_back(remark);
+    std::cerr << "omnister: " << remark << '\n';
+  }
+  if (match.statistics.valid == 0 && remarks.empty()) {
+    std::cerr << "omnister: no pixel got a range; rejected by test:";
+    for (const auto& [reason, count] : match.statistics.rejected)
+      if (count > 0) std::cerr << ' ' << reason << ' ' << count;
+    std::cerr << '\n';
+  }
   result["threads"] = threadCount(arguments.options.threads);
   result["repeat"] = arguments.repeat;
   nlohmann::ordered_json& seconds = result["seconds"];
@@ -346,9 +443,10 @@ void addStereo(CLI::App& app) {
       ->capture_default_str();
   command->add_option("--thesis-window", arguments->thesis_window, "Side of that mask, odd [px]")
       ->capture_default_str();
-  command->add_flag("--refine", arguments->options.refine,
-                    "Let grey values have the last word on a pair's ranges: half the error for a few "
-                    "times the time; several displaced images always are refined");
+  command->add_flag(
+      "--refine", arguments->options.refine,
+      "Let grey values have the last word on a pair's ranges: half the error for a few "
+      "times the time; several displaced images always are refined");
   command->add_option("--threads", arguments->options.threads, "Threads; 0: every core")
       ->check(CLI::Range(0, 1024))
       ->capture_default_str();
@@ -361,6 +459,21 @@ void addStereo(CLI::App& app) {
       ->add_option("--mask", arguments->mask,
                    "Image of the reference size; pixels that are 0 in it are left out")
       ->type_name("IMAGE");
+  command
+      ->add_option(
+          "--roi", arguments->roi,
+          "Region of interest of the reference image, \"x,y,width,height\" [px]; what lies "
+          "around it is left out")
+      ->type_name("X,Y,W,H");
+  command
+      ->add_option("--reduce", arguments->reduce,
+                   "Reduce the images so many times, and the cloud with them")
+      ->capture_default_str();
+  command
+      ->add_option("--prior", arguments->prior,
+                   "Range image of the cloud's size, of a frame before: it stands where the images "
+                   "find nothing themselves but their grey values confirm it")
+      ->type_name("RANGE.tiff");
   command->add_option("--cloud", arguments->cloud, "Organized cloud to write")
       ->type_name("OUT.ply|OUT.pcd");
   command

@@ -37,6 +37,10 @@ struct MatcherOptions {
   /// Grey values have the last word on a pair's ranges too: half the error for a few times the time.
   /// With several displaced images they always have. Sweep only.
   bool refine = false;
+  /// What is known before: CV_32FC1 of the reference size, range along the ray [m], NaN where it is
+  /// not; may be empty. Where images alone find nothing it stands if their grey values confirm it,
+  /// and is moved by them; where they find something else, that stands. Sweep only.
+  cv::Mat prior;
   cv::Mat mask;                     ///< CV_8UC1 of the reference size, 0 leaves a pixel out; may be empty
 };
 

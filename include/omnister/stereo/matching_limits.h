@@ -2,7 +2,9 @@
 /// @file What every matcher checks before it allocates anything.
 #pragma once
 
+#include <string>
 #include <string_view>
+#include <vector>
 
 #include "omnister/stereo/matcher.h"
 
@@ -38,5 +40,10 @@ void checkMemory(double bytes, std::string_view what);
 /// @throws Error unless the images have the sizes of the geometry, are CV_8UC1 and as many
 void checkImages(const StereoGeometry& geometry, const cv::Mat& reference,
                  const std::vector<cv::Mat>& displaced);
+
+/// What is wrong with images that were taken all the same, one line each: black, saturated, without
+/// contrast, or of a very different exposure than the reference.
+std::vector<std::string> imageRemarks(const cv::Mat& reference,
+                                      const std::vector<cv::Mat>& displaced);
 
 }  // namespace omnister

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // One suite for every model and structure; closed forms of the single models below it.
 #include "omnister/lens/lens_models.h"
+#include "omnister/lens/reduced_lens.h"
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
@@ -770,6 +771,35 @@ TEST(MakeLens, NamesWhatIsWrongInAFile) {
               HasSubstr("one-to-one"));
   EXPECT_THAT(message("spline", {{"span", {1.0}}, {"radii", {1, 2, 3, 4}}, {"r1", {1}}}),
               HasSubstr("r1"));
+}
+
+TEST(ReducedLens, PixelsCoverSquaresOfTheFullImage) {
+  LensStructure structure;
+  structure.model = "conic";
+  const LensPtr lens = makeLens(structure, {320.3, 239.8}, 200.0, 1.4);
+  EXPECT_EQ(reducedLens(lens, 1), lens);
+  const LensPtr half = reducedLens(lens, 2), fifth = reducedLens(lens, 5);
+  // The first pixel of the half image lies between four of the full one.
+  const auto corner = half->unproject({100.0, 80.0});
+  const auto full = lens->unproject({200.5, 160.5});
+  ASSERT_TRUE(corner && full);
+  EXPECT_LT((*corner - *full).norm(), 1e-12);
+  for (const LensPtr& reduced : {half, fifth}) {
+    const Eigen::Vector3d ray = Eigen::Vector3d(0.4, -0.3, 0.6).normalized();
+    Jacobian23 slope;
+    const auto pixel = reduced->project(ray, &slope, nullptr);
+    ASSERT_TRUE(pixel);
+    const auto back = reduced->unproject(*pixel);
+    ASSERT_TRUE(back);
+    EXPECT_LT((*back - ray).norm(), 1e-9);
+    const double step = 1e-6;
+    const auto beside = reduced->project(ray + step * Eigen::Vector3d::UnitX());
+    ASSERT_TRUE(beside);
+    EXPECT_LT(((*beside - *pixel) / step - slope.col(0)).norm(), 1e-2);
+  }
+  EXPECT_NEAR(*half->surfaceHeight(10, 5), *lens->surfaceHeight(20, 10) / 2, 1e-12);
+  EXPECT_THROW(reducedLens(lens, 0), Error);
+  EXPECT_THROW(reducedLens(nullptr, 2), Error);
 }
 
 }  // namespace

@@ -202,6 +202,66 @@ TEST_F(StereoCommand, SeveralDisplacedImagesWithTheirPoses) {
               HasSubstr("2 lenses"));
 }
 
+TEST_F(StereoCommand, RegionReductionAndPrior) {
+  const auto json = [&](const std::map<std::string, std::string>& changed,
+                        const std::vector<std::string>& added) {
+    auto call = arguments(changed, added);
+    call.push_back("--json");
+    const Outcome outcome = run(call);
+    EXPECT_EQ(outcome.code, 0) << outcome.err;
+    return nlohmann::json::parse(outcome.out);
+  };
+  const std::map<std::string, std::string> sweep = {{"--matcher", ""}};
+  EXPECT_LE(json(sweep, {"--roi", "40,30,30,20"})["valid"].get<int>(), 600);
+  // The wall is where it was, on a grid of half the size.
+  const auto half = json(sweep, {"--reduce", "2"});
+  EXPECT_EQ(half["width"], 64);
+  EXPECT_EQ(half["height"], 48);
+  const Cloud cloud = readCloud(path("cloud.ply"));
+  int valid = 0, on_wall = 0;
+  for (int v = 0; v < cloud.xyz.rows; ++v) {
+    for (int u = 0; u < cloud.xyz.cols; ++u) {
+      const auto& p = cloud.xyz.at<cv::Vec3f>(v, u);
+      if (std::isnan(p[2])) continue;
+      ++valid;
+      on_wall += std::abs(p[2] - 2.0) < 0.1;
+    }
+  }
+  EXPECT_GT(valid, 1000);
+  EXPECT_GT(on_wall, 0.6 * valid);
+  // A range image of the frame before fills what the images leave open, and no more than they show.
+  const int alone = json(sweep, {"--refine"})["valid"].get<int>();
+  fs::copy(path("range.tiff"), path("before.tiff"));
+  const int with = json(sweep, {"--prior", path("before.tiff")})["valid"].get<int>();
+  EXPECT_GE(with, alone);
+  EXPECT_THAT(refusal(arguments(sweep, {"--prior", path("before.tiff"), "--reduce", "2"})),
+              HasSubstr("before.tiff"));
+  EXPECT_THAT(refusal(arguments({}, {"--refine"})), HasSubstr("--refine is for the sweep"));
+  for (const char* roi : {"1,2,3", "0,0,0,5", "0,0,129,5", "a,b,c,d", "-1,0,5,5", "1,1,5,5,5"})
+    EXPECT_THAT(refusal(arguments(sweep, {"--roi", roi})), HasSubstr("--roi"));
+  for (const char* reduce : {"0", "-1", "65", "16"})
+    EXPECT_THAT(refusal(arguments(sweep, {"--reduce", reduce})), HasSubstr("reduce"));
+}
+
+TEST_F(StereoCommand, SaysWhyImagesGiveNothing) {
+  const auto err = [&](const cv::Mat& displaced, const char* matcher) {
+    cv::imwrite(path("other.png"), displaced);
+    const Outcome outcome =
+        run(arguments({{"--matcher", matcher}, {"--displaced", path("other.png")}}, {"--json"}));
+    EXPECT_EQ(outcome.code, 0) << outcome.err;
+    const auto json = nlohmann::json::parse(outcome.out);
+    EXPECT_EQ(json["remarks"].size(), 1u);
+    return outcome.err;
+  };
+  const auto plain = [&](int grey) { return cv::Mat(96, 128, CV_8UC1, cv::Scalar(grey)); };
+  for (const char* matcher : {"", "thesis"}) {
+    EXPECT_THAT(err(plain(0), matcher), HasSubstr("displaced image 1 is black"));
+    EXPECT_THAT(err(plain(255), matcher), HasSubstr("displaced image 1 is saturated: 100 %"));
+    EXPECT_THAT(err(plain(90), matcher), HasSubstr("displaced image 1 has no contrast"));
+    EXPECT_THAT(err(displaced_ * 0.25, matcher), HasSubstr("exposed otherwise"));
+  }
+}
+
 TEST_F(StereoCommand, RefusesBadInputAndTouchesNothing) {
   cv::imwrite(path("small.png"), cv::Mat(10, 12, CV_8UC1, cv::Scalar(7)));
   cv::imwrite(path("float.tiff"), cv::Mat(96, 128, CV_32FC1, cv::Scalar(7)));
