@@ -60,6 +60,14 @@ void HalveRows(const PaddedImage& image, PaddedImage* out, int begin, int end) {
   }
 }
 
+/// x, x + 1, and so on. Iota of a variable is put together in memory, lane by lane.
+template <class D>
+HWY_INLINE hn::Vec<D> Count(D d, int x) {
+  HWY_ALIGN static constexpr std::int32_t kFirst[16] = {0, 1, 2,  3,  4,  5,  6,  7,
+                                                        8, 9, 10, 11, 12, 13, 14, 15};
+  return hn::Add(hn::Load(d, kFirst), hn::Set(d, x));
+}
+
 // Vector gathers are slow on many processors: addresses are computed by vectors, memory is read by
 // plain loads, and vectors go on with what was read.
 
@@ -97,7 +105,7 @@ void SampleRow(const PaddedImage& image, const float* x, const float* y, const s
       const auto du = static_cast<std::int32_t>(seen ? (x[run + 1] - x[run]) * (kOne / 8) : 0.0f);
       const auto dv = static_cast<std::int32_t>(seen ? (y[run + 1] - y[run]) * (kOne / 8) : 0.0f);
       for (int i = 0; i < 8; i += lanes) {
-        const auto step = hn::Iota(d, i);
+        const auto step = Count(d, i);
         auto u = hn::Add(hn::Set(d, u0), hn::Mul(step, hn::Set(d, du)));
         auto v = hn::Add(hn::Set(d, v0), hn::Mul(step, hn::Set(d, dv)));
         if (mask[run] != 0xFF) {
@@ -467,11 +475,11 @@ void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
     const auto row = hn::NearestInt(hn::Add(
         hn::Mul(hn::ConvertTo(df, p), hn::Set(df, job.row_scale)), hn::Set(df, job.row_offset)));
     hn::Store(hn::Min(hn::Max(row, hn::Zero(di)), hn::Set(di, job.rows - 1)), di, rows);
-    const auto slope = hn::Mul(hn::ConvertTo(df, hn::Iota(di, x)), hn::Set(df, job.guess_x));
+    const auto slope = hn::Mul(hn::ConvertTo(df, Count(di, x)), hn::Set(df, job.guess_x));
     const auto column = hn::Add(hn::Mul(hn::LoadU(df, a + x), hn::Set(df, job.to_column)),
                                 hn::Add(slope, hn::Set(df, job.guess)));
     const auto pattern = hn::And(
-        hn::Add(hn::Mul(hn::Iota(di, x), hn::Set(di, kDitherX)), hn::Set(di, job.dither_phase)),
+        hn::Add(hn::Mul(Count(di, x), hn::Set(di, kDitherX)), hn::Set(di, job.dither_phase)),
         hn::Set(di, 255));
     const auto dither = hn::Mul(hn::ConvertTo(df, hn::Sub(pattern, hn::Set(di, 128))),
                                 hn::Set(df, job.dither / 256.0f));
@@ -557,9 +565,8 @@ void ConcludeRow(ConcludeJob* in_out) {
     const auto shift =
         hn::Div(hn::Mul(hn::Sub(before, after), hn::Set(df, kGain)),
                 hn::Max(hn::Sub(hn::Add(before, after), hn::Add(c, c)), hn::Set(df, 1.0f)));
-    const auto guess =
-        hn::Add(hn::Mul(hn::ConvertTo(df, hn::Iota(di, x)), hn::Set(df, job.guess_x)),
-                hn::Set(df, job.guess));
+    const auto guess = hn::Add(hn::Mul(hn::ConvertTo(df, Count(di, x)), hn::Set(df, job.guess_x)),
+                               hn::Set(df, job.guess));
     const auto columns =
         hn::Add(hn::Add(hn::ConvertTo(df, k), shift), hn::LoadU(df, job.residual + x));
     const auto h = hn::Mul(hn::Add(columns, guess), hn::Set(df, job.step_h));
@@ -581,7 +588,7 @@ void ConcludeRow(ConcludeJob* in_out) {
       const auto row = hn::Min(hn::Max(v, hn::Zero(di)), hn::Set(di, job.claim_height - 1));
       const auto at = hn::Add(hn::Mul(row, hn::Set(di, job.claim_width)), column);
       const auto counted =
-          hn::And(hn::RebindMask(di, fine), hn::Lt(hn::Iota(di, x), hn::Set(di, job.count)));
+          hn::And(hn::RebindMask(di, fine), hn::Lt(Count(di, x), hn::Set(di, job.count)));
       hn::StoreU(hn::IfThenElse(counted, at, hn::Set(di, -1)), di, job.claim + x);
     }
   }
@@ -593,9 +600,9 @@ HWY_INLINE void Claim(DI di, const ClaimJob& job, int x, hn::Vec<DI>* at, hn::Ve
   const hn::RebindToFloat<DI> df;
   const auto claim = hn::LoadU(di, job.claim + x);
   const auto made =
-      hn::And(hn::Gt(claim, hn::Set(di, -1)), hn::Lt(hn::Iota(di, x), hn::Set(di, job.count)));
+      hn::And(hn::Gt(claim, hn::Set(di, -1)), hn::Lt(Count(di, x), hn::Set(di, job.count)));
   // Those that claim nothing go each to an element of its own, so that none waits.
-  *at = hn::IfThenElse(made, claim, hn::Iota(di, job.none));
+  *at = hn::IfThenElse(made, claim, Count(di, job.none));
   // An offset, so that small negative hypotheses can be told.
   const auto counted = hn::NearestInt(
       hn::Add(hn::Mul(hn::LoadU(df, job.h + x), hn::Set(df, job.units)), hn::Set(df, 64.0f)));
@@ -614,7 +621,11 @@ void ClaimRow(const ClaimJob& job) {
     const auto cost = hn::PromoteTo(di, hn::LoadU(du16, job.cost + x));
     hn::Store(element, di, at);
     hn::Store(hn::Or(hn::ShiftLeft<16>(cost), units), di, value);
-    for (int i = 0; i < lanes; ++i) claims[at[i]] = std::min(claims[at[i]], value[i]);
+    for (int i = 0; i < lanes; ++i) {
+      // The lesser of two that are not negative, without a branch that half would take wrongly.
+      const std::int32_t less = value[i] - claims[at[i]];
+      claims[at[i]] += less & (less >> 31);
+    }
   }
 }
 
@@ -635,7 +646,7 @@ void RejectRow(RejectJob* in_out) {
   for (int x = 0; x < count; x += lanes) {
     const auto h = hn::LoadU(df, job.h[1] + x);
     const auto known =
-        hn::And(hn::RebindMask(df, hn::Lt(hn::Iota(di, x), hn::Set(di, count))), hn::Eq(h, h));
+        hn::And(hn::RebindMask(df, hn::Lt(Count(di, x), hn::Set(di, count))), hn::Eq(h, h));
     hn::Vec<decltype(di)> element, mine;
     Claim(di, job.claimed, x, &element, &mine);
     hn::Store(element, di, at);
@@ -731,7 +742,7 @@ void TriangulateRow(TriangulateJob* job) {
   };
   const auto nan = hn::NaN(d);
   for (int x = 0; x < job->count; x += lanes) {
-    const auto in = hn::RebindMask(d, hn::Lt(hn::Iota(di, x), hn::Set(di, job->count)));
+    const auto in = hn::RebindMask(d, hn::Lt(Count(di, x), hn::Set(di, job->count)));
     HWY_ALIGN float ends[HWY_MAX_BYTES / sizeof(float)] = {};
     const bool whole = x + lanes <= job->count;
     if (!whole) std::copy(job->h + x, job->h + job->count, ends);
