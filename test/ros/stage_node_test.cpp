@@ -184,15 +184,22 @@ class StageNode : public testing::Test {
     home();
 
     begin(0.3, 0.02);
+    ros::WallTime event = ros::WallTime::now();
+    const auto record = [&](const std::string& what) {
+      RecordProperty(what, std::to_string((ros::WallTime::now() - event).toSec()));
+    };
     device_->unplug();
     ASSERT_TRUE(client_->waitForResult(ros::Duration(60.0)));
     EXPECT_EQ(client_->getState(), SimpleClientGoalState::ABORTED);
     ASSERT_TRUE(eventually([&] { return states_->last()->fault == "link lost"; }, 30.0));
+    record("seconds_to_notice");
     EXPECT_FALSE(states_->last()->homed);
     EXPECT_EQ(move(0.1), SimpleClientGoalState::REJECTED);
     EXPECT_TRUE(truth_->read().moving) << "nobody could tell it to stop";
+    event = ros::WallTime::now();
     device_->plugIn();
     ASSERT_TRUE(eventually([&] { return states_->last()->fault.empty(); }, 30.0));
+    record("seconds_to_return");
     EXPECT_TRUE(eventually([&] { return !truth_->read().moving; }, 30.0));
     EXPECT_LT(truth(), 0.29) << "it went on without anybody watching";
     if (!states_->last()->homed) home();
