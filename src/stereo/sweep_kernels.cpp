@@ -505,20 +505,23 @@ void MapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
   }
 }
 
-void BoxMeanRow(const float* in, int stride, int count, bool next, float* HWY_RESTRICT line,
-                float* HWY_RESTRICT out) {
+void BoxColumns(const float* in, int stride, int width, int height, float* HWY_RESTRICT out) {
   const hn::ScalableTag<float> d;
   const int lanes = static_cast<int>(hn::Lanes(d));
-  for (int x = 0; x < count + kWindow - 1; x += lanes) {
+  for (int x = 0; x < width; x += lanes) {
     auto sum = hn::Zero(d);
-    if (next) {
-      sum = hn::Add(hn::LoadU(d, line + x), hn::Sub(hn::LoadU(d, in + (kWindow - 1) * stride + x),
-                                                    hn::LoadU(d, in - stride + x)));
-    } else {
-      for (int k = 0; k < kWindow; ++k) sum = hn::Add(sum, hn::LoadU(d, in + k * stride + x));
+    for (int k = 0; k < kWindow - 1; ++k) sum = hn::Add(sum, hn::LoadU(d, in + k * stride + x));
+    for (int y = 0; y < height; ++y) {
+      sum = hn::Add(sum, hn::LoadU(d, in + (y + kWindow - 1) * stride + x));
+      hn::StoreU(sum, d, out + y * stride + x);
+      sum = hn::Sub(sum, hn::LoadU(d, in + y * stride + x));
     }
-    hn::StoreU(sum, d, line + x);
   }
+}
+
+void BoxMeanRow(const float* line, int count, float* HWY_RESTRICT out) {
+  const hn::ScalableTag<float> d;
+  const int lanes = static_cast<int>(hn::Lanes(d));
   const auto scale = hn::Set(d, 1.0f / (kWindow * kWindow));
   for (int x = 0; x < count; x += lanes) {
     auto sum = hn::LoadU(d, line + x);
@@ -815,6 +818,7 @@ HWY_EXPORT(RejectRow);
 HWY_EXPORT(ConcludeRow);
 HWY_EXPORT(MapCells);
 HWY_EXPORT(MapRow);
+HWY_EXPORT(BoxColumns);
 HWY_EXPORT(BoxMeanRow);
 HWY_EXPORT(TargetName);
 
@@ -863,8 +867,12 @@ void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int cou
   HWY_DYNAMIC_DISPATCH(MapRow)(job, phi, a, count, base, residual);
 }
 
-void boxMeanRow(const float* in, int stride, int count, bool next, float* line, float* out) {
-  HWY_DYNAMIC_DISPATCH(BoxMeanRow)(in, stride, count, next, line, out);
+void boxColumns(const float* in, int stride, int width, int height, float* out) {
+  HWY_DYNAMIC_DISPATCH(BoxColumns)(in, stride, width, height, out);
+}
+
+void boxMeanRow(const float* line, int count, float* out) {
+  HWY_DYNAMIC_DISPATCH(BoxMeanRow)(line, count, out);
 }
 
 void concludeRow(ConcludeJob* job) { HWY_DYNAMIC_DISPATCH(ConcludeRow)(job); }

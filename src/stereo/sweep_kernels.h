@@ -122,10 +122,12 @@ struct MapJob {
 void mapRow(const MapJob& job, const std::uint16_t* phi, const float* a, int count,
             std::int32_t* base, float* residual);
 
-/// Mean of the window, for `count` pixels of a row whose windows begin at `in`.
-/// @param next whether `line` is as the call for the row above left it
-/// @param line room for count + kWindow, rounded up to a vector
-void boxMeanRow(const float* in, int stride, int count, bool next, float* line, float* out);
+/// Sums of columns of the window that begin at `in`. @param out as `in` strided; vectors may write
+/// past the width
+void boxColumns(const float* in, int stride, int width, int height, float* out);
+/// Mean of the window, for `count` pixels of a row. @param line of boxColumns(); a vector and the
+/// window past count must be readable
+void boxMeanRow(const float* line, int count, float* out);
 
 /// From costs to hypotheses, one row of a tile.
 struct ConcludeJob {

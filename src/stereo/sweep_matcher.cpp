@@ -95,7 +95,7 @@ struct Sample {
 /// What a thread keeps between tiles.
 struct Scratch {
   std::vector<std::int32_t> base;
-  std::vector<float> residual, residual_line, residual_mean;
+  std::vector<float> residual, residual_sums, residual_mean;
   MapView view;
   std::vector<std::int16_t> wide;
   std::vector<std::uint8_t> reference[kPlanes], costs, grey;
@@ -432,7 +432,7 @@ class SweepMatcher : public SweepPair {
 
   /// The plane through three neighbouring samples that most others lie on.
   static bool samplePlane(const std::vector<Sample>& samples, int needed, Guess* guess) {
-    constexpr int kTrials = 20;
+    constexpr int kTrials = 12;
     const std::size_t n = samples.size();
     const std::size_t stride = std::max<std::size_t>(1, n / 96);
     std::uint32_t random = 12345;
@@ -663,7 +663,9 @@ class SweepMatcher : public SweepPair {
     const Tile& tile = level.layout.tiles[t];
     const Band& band = level.grid.bands[tile.band];
     const cv::Rect where = guess.where + tile.rect.tl();
-    scratch->residual_line.resize(stride + 64);
+    scratch->residual_sums.resize(static_cast<std::size_t>(stride) * where.height + 64);
+    boxColumns(&scratch->residual[static_cast<std::size_t>(guess.where.y) * stride + guess.where.x],
+               stride, where.width + 2 * kRadius, where.height, scratch->residual_sums.data());
     scratch->residual_mean.resize(stride + 64);
     if (merge) {
       scratch->row_h.resize(stride + 64);
@@ -689,8 +691,8 @@ class SweepMatcher : public SweepPair {
     for (int y = 0; y < where.height; ++y) {
       const std::size_t corner =
           static_cast<std::size_t>(guess.where.y + y) * stride + guess.where.x;
-      boxMeanRow(&scratch->residual[corner], stride, where.width, y > 0,
-                 scratch->residual_line.data(), scratch->residual_mean.data());
+      boxMeanRow(&scratch->residual_sums[static_cast<std::size_t>(y) * stride], where.width,
+                 scratch->residual_mean.data());
       const std::size_t i = static_cast<std::size_t>(y) * where.width;
       const std::size_t pixel = scratch->view.at(where.x, where.y + y);
       job.cost = &scratch->cost[i];
