@@ -9,6 +9,7 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <opencv2/core.hpp>
 #include <tuple>
 #include <utility>
 
@@ -113,6 +114,13 @@ struct Scratch {
   std::vector<float> rows[3], nothing;  ///< between two filters
 };
 
+/// Whether all of an image is of one grey level, give or take one.
+bool isBlank(const cv::Mat& image) {
+  double least = 0, most = 0;
+  cv::minMaxLoc(image, &least, &most);
+  return most - least <= 2;
+}
+
 /// A plane of one value a pixel; vector code may read 16 elements before a row, and write up to 64
 /// behind it.
 cv::Mat makePlane(cv::Size size, int type, double value = -1) {
@@ -171,6 +179,15 @@ class SweepMatcher : public SweepPair {
     const auto start = std::chrono::steady_clock::now();
     for (Scratch& scratch : *scratch_) scratch.claims.clear();
     MatchResult result;
+    // Plain images match each other, and what is saturated in others, anywhere.
+    if (isBlank(reference) || isBlank(displaced.front())) {
+      for (cv::Mat* plane : {&result.range, &result.sigma, &result.score})
+        *plane = cv::Mat(reference.size(), CV_32FC1, cv::Scalar(kNaN));
+      result.statistics.rejected["no contrast"] = field_;
+      result.statistics.seconds["total"] =
+          std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+      return result;
+    }
     Stopwatch watch(&result.statistics.seconds);
     makePyramid(reference, &Level::reference);
     makePyramid(displaced.front(), &Level::displaced);

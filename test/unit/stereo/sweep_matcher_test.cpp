@@ -269,6 +269,9 @@ TEST_F(SmallPair, ExposureDoesNotMatter) {
 }
 
 TEST_F(SmallPair, ImagesWithoutContentGiveNothing) {
+  const auto match = [&](const cv::Mat& reference, const cv::Mat& displaced) {
+    return makeSweepMatcher(pair_.geometry, {})->match(reference, {displaced}).statistics.valid;
+  };
   for (const int grey : {0, 127, 255}) {
     const cv::Mat flat(size_, CV_8UC1, cv::Scalar(grey));
     const MatchResult result = makeSweepMatcher(pair_.geometry, {})->match(flat, {flat});
@@ -276,6 +279,8 @@ TEST_F(SmallPair, ImagesWithoutContentGiveNothing) {
     std::size_t rejected = 0;
     for (const auto& [name, count] : result.statistics.rejected) rejected += count;
     EXPECT_GT(rejected, 20000u) << "every pixel of the field is told why it has no range";
+    EXPECT_EQ(match(flat, pair_.displaced), 0u) << grey;
+    EXPECT_EQ(match(pair_.reference.image, flat), 0u) << grey;
   }
 }
 
