@@ -100,32 +100,31 @@ float coarseAt(const cv::Mat& h, float near, int scale, int x, int y) {
 /// Spots of the displaced image, by what was matched with them.
 class Spots {
  public:
-  Spots(const MapView& map, float step) : map_(map), per_radian_(1 / (2 * step)) {
+  explicit Spots(float step) : per_radian_(1 / (2 * step)) {
     width_ = static_cast<int>(kPi * per_radian_) + 3;
     height_ = static_cast<int>(2 * kPi * per_radian_) + 3;
     seen_.assign(static_cast<std::size_t>(width_) * height_, kNaN);
   }
-  void see(int x, int y, float h) {
-    float& spot = seen_[at(x, y, h)];
+  void see(const MapView& map, int x, int y, float h) {
+    float& spot = seen_[at(map, x, y, h)];
     if (std::isnan(spot) || h > spot) spot = h;
   }
   /// Whether another range was seen there.
-  bool taken(int x, int y, float h, float tolerance) const {
-    const float spot = seen_[at(x, y, h)];
+  bool taken(const MapView& map, int x, int y, float h, float tolerance) const {
+    const float spot = seen_[at(map, x, y, h)];
     return std::fabs(spot - h) > tolerance;  // false for NaN
   }
 
  private:
-  std::size_t at(int x, int y, float h) const {
-    const std::size_t i = map_.at(x, y);
-    const float phi = static_cast<float>(map_.phi[i]) / static_cast<float>(kPhiUnits) - kPi;
-    const float theta = map_.a[i] + h;
+  std::size_t at(const MapView& map, int x, int y, float h) const {
+    const std::size_t i = map.at(x, y);
+    const float phi = static_cast<float>(map.phi[i]) / static_cast<float>(kPhiUnits) - kPi;
+    const float theta = map.a[i] + h;
     const int column = std::clamp(static_cast<int>(theta * per_radian_), 0, width_ - 1);
     const int row =
         std::clamp(static_cast<int>((phi * std::sin(theta) + kPi) * per_radian_), 0, height_ - 1);
     return static_cast<std::size_t>(row) * width_ + column;
   }
-  const MapView& map_;
   float per_radian_;
   int width_ = 0, height_ = 0;
   std::vector<float> seen_;
@@ -139,17 +138,21 @@ WeakFill::~WeakFill() = default;
 
 std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
   const int width = job.map->size.width, height = job.map->size.height;
-  MapView map, half;
-  const auto hasRay = [&](int x, int y) { return map.phi[map.at(x, y)] != kNoRay; };
+  // Views of rows: one of all pixels would be the largest thing here.
+  const auto viewRow = [](const ReferenceMap& map, int y, MapView* view) {
+    viewMap(map, cv::Rect(0, y, map.size.width, 1), view);
+  };
+  const auto hasRay = [](const MapView& map, int x) { return map.phi[x] != kNoRay; };
+  MapView map;
   sigma->release();
   if (job.coarse.empty()) return 0;
   // A look at every sixteenth pixel tells whether there is anything to do.
   std::size_t field = 0, open = 0;
   for (int y = 2; y < height; y += 4) {
     const float* line = h->ptr<float>(y);
-    viewMap(*job.map, cv::Rect(0, y, width, 1), &map);
+    viewRow(*job.map, y, &map);
     for (int x = 2; x < width; x += 4) {
-      if (!hasRay(x, y)) continue;
+      if (!hasRay(map, x)) continue;
       ++field;
       if (!std::isnan(line[x]) || !isWeak(job.reference, x, y)) continue;
       for (std::size_t l = 0; l < job.coarse.size(); ++l) {
@@ -172,24 +175,24 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
     removeSpeckles(&surfaces.back(), near, kCoherent, threads_);
     averageSurface(&surfaces.back(), near, threads_);
   }
-  viewMap(*job.map, cv::Rect(0, 0, width, height), &map);
-  viewMap(*job.half, cv::Rect(cv::Point(), job.half->size), &half);
+  const cv::Size half = job.half->size;
   const float b = job.baseline;
-  cv::Mat inverse(half.size, CV_32FC1), weight(half.size, CV_32FC1, cv::Scalar(0));
-  const cv::Mat support(half.size, CV_8UC1, cv::Scalar(1));
+  cv::Mat inverse(half, CV_32FC1), weight(half, CV_32FC1, cv::Scalar(0));
+  const cv::Mat support(half, CV_8UC1, cv::Scalar(1));
   parallelFor(
-      0, static_cast<std::size_t>(half.size.height), threads_,
+      0, static_cast<std::size_t>(half.height), threads_,
       [&](std::size_t row) {
         const int y = static_cast<int>(row);
         float* to = inverse.ptr<float>(y);
-        for (int x = 0; x < half.size.width; ++x) {
-          const std::size_t i = half.at(x, y);
+        MapView view;
+        viewRow(*job.half, y, &view);
+        for (int x = 0; x < half.width; ++x) {
           to[x] = kNaN;
-          if (half.phi[i] == kNoRay) continue;
+          if (!hasRay(view, x)) continue;
           for (std::size_t l = 0; l < surfaces.size(); ++l) {
             const float found = coarseAt(surfaces[l], kSurface * job.coarse[l].step, 1 << l, x, y);
-            if (!(found > 0) || !(half.a[i] + found < kPi)) continue;
-            to[x] = std::sin(found) / (b * std::sin(half.a[i] + found));
+            if (!(found > 0) || !(view.a[x] + found < kPi)) continue;
+            to[x] = std::sin(found) / (b * std::sin(view.a[x] + found));
             break;
           }
         }
@@ -200,14 +203,16 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
   refinement_->refine(job.reference, {job.displaced}, support, &inverse, &weight);
   // Back to hypotheses; weight becomes their standard deviation.
   parallelFor(
-      0, static_cast<std::size_t>(half.size.height), threads_,
+      0, static_cast<std::size_t>(half.height), threads_,
       [&](std::size_t row) {
         const int y = static_cast<int>(row);
         float* w = inverse.ptr<float>(y);
         float* s = weight.ptr<float>(y);
-        for (int x = 0; x < half.size.width; ++x) {
+        MapView view;
+        viewRow(*job.half, y, &view);
+        for (int x = 0; x < half.width; ++x) {
           if (std::isnan(w[x])) continue;
-          const float a = half.a[half.at(x, y)];
+          const float a = view.a[x];
           const auto hypothesis = [&](float at) {
             return std::atan2(b * at * std::sin(a), 1 - b * at * std::cos(a));
           };
@@ -219,13 +224,14 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
       },
       8);
 
-  Spots spots(map, job.step);
+  Spots spots(job.step);
   for (int y = 0; y < height; y += 2) {
     const float* line = h->ptr<float>(y);
+    viewRow(*job.map, y, &map);
     for (int x = 0; x < width; x += 2)
-      if (!std::isnan(line[x])) spots.see(x, y, line[x]);
+      if (!std::isnan(line[x])) spots.see(map, x, y, line[x]);
   }
-  sigma->create(map.size, CV_32FC1);
+  sigma->create(height, width, CV_32FC1);
   sigma->setTo(kNaN);
   const float step = job.coarse[0].step;
   parallelFor(
@@ -234,14 +240,16 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
         const int y = static_cast<int>(row);
         float* line = h->ptr<float>(y);
         float* to = sigma->ptr<float>(y);
+        MapView view;
+        viewRow(*job.map, y, &view);
         for (int x = 0; x < width; ++x) {
-          if (!hasRay(x, y)) continue;
+          if (!hasRay(view, x)) continue;
           const float found = coarseAt(inverse, kSurface * step, 2, x, y);
           if (std::isnan(found)) continue;
           float spread = weight.at<float>(y / 2, x / 2);
           if (!(spread > 0)) spread = 0.5f * step;
           if (std::isnan(line[x])) {
-            if (spots.taken(x, y, found, kSame * step)) continue;
+            if (spots.taken(view, x, y, found, kSame * step)) continue;
             line[x] = found;
             to[x] = kSpread * spread;
             continue;
