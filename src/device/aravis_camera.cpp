@@ -4,7 +4,9 @@
 #include <arpa/inet.h>
 #include <arv.h>
 #include <poll.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
+#include <sys/syscall.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -301,7 +303,8 @@ class AravisCamera : public Camera {
                         " bytes");
     }
     payload_ = payload;
-    stream_.reset(arv_camera_create_stream(camera_.get(), nullptr, nullptr, failure.out()));
+    stream_.reset(
+        arv_camera_create_stream(camera_.get(), &AravisCamera::onStream, nullptr, failure.out()));
     refuseIf(failure, "no stream can be opened");
     if (ARV_IS_GV_STREAM(stream_.get())) tuneGigeStream();
     for (int i = 0; i < settings_.buffers; ++i) pushNewBuffer();
@@ -444,6 +447,14 @@ class AravisCamera : public Camera {
 
   static void onControlLost(ArvDevice* /*device*/, gpointer self) {
     static_cast<AravisCamera*>(self)->lost_ = true;
+  }
+
+  /// In the thread that takes packets from the kernel, which must not wait for others: what it
+  /// misses is lost. Without the right to, it stays as it is.
+  static void onStream(void* /*data*/, ArvStreamCallbackType type, ArvBuffer* /*buffer*/) {
+    if (type != ARV_STREAM_CALLBACK_TYPE_INIT) return;
+    constexpr int kAboveOthers = -10;
+    setpriority(PRIO_PROCESS, static_cast<id_t>(syscall(SYS_gettid)), kAboveOthers);
   }
 
   void requireAlive() const {

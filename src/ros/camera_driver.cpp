@@ -250,6 +250,7 @@ void CameraDriver::openIfNeeded() {
   ROS_INFO_STREAM("opened " << printable(describe(identity)));
   last_sequence_.reset();
   streamed_ = false;
+  torn_ = 0;
   takeRemarks();
   takeControls(camera_->controls());
   statistics_due_ = Steady::time_point();
@@ -332,11 +333,20 @@ void CameraDriver::watch() {
   problem << std::fixed << std::setprecision(1) << "the camera gives no frame for " << silent
           << " s";
   if (camera_->live()) {
-    if (!streamed_) {
-      problem << " although it was started (a firewall, packets larger than the network lets "
-                 "through, or too many of them for it?)";
+    // A camera whose frames come torn is not lost, and opening it again would not mend that.
+    const std::uint64_t torn = camera_->statistics().incomplete;
+    if (torn <= torn_) {
+      if (!streamed_) {
+        problem << " although it was started (a firewall, packets larger than the network lets "
+                   "through, or too many of them for it?)";
+      }
+      throw device::CameraError(problem.str());
     }
-    throw device::CameraError(problem.str());
+    problem << ": " << torn - torn_
+            << " came incomplete (a lower frame_rate, larger packet_size, packet_delay_us or "
+               "socket_buffer may help)";
+    torn_ = torn;
+    last_frame_ = Steady::now();
   }
   {
     const std::lock_guard<std::mutex> lock(mutex_);
@@ -358,6 +368,8 @@ void CameraDriver::pollStatistics() {
   if (Steady::now() < statistics_due_) return;
   statistics_due_ = Steady::now() + kPollStatistics;
   const device::CameraStatistics statistics = camera_->statistics();
+  // Only what is torn while nothing else comes counts for the watchdog.
+  if (secondsSince(last_frame_) < kPollStatistics.count()) torn_ = statistics.incomplete;
   const std::lock_guard<std::mutex> lock(mutex_);
   statistics_ = statistics;
 }

@@ -151,6 +151,7 @@ class CameraDriver {
   device::CameraSettings settings_;
   bool streaming_ = false;
   bool streamed_ = false;   // a frame came since it was started
+  std::uint64_t torn_ = 0;  // incomplete frames when whole ones still came
   double slowest_s_ = 0.0;  // as long as the device itself may take for a frame
   std::chrono::steady_clock::time_point statistics_due_;
   std::optional<std::uint64_t> last_sequence_;
