@@ -14,20 +14,21 @@
 
 namespace omnister::test {
 
-/// Another program beside the test, silent; killed at the end, also when the test dies.
+/// Another program beside the test; killed at the end, also when the test dies.
 class ChildProcess {
  public:
-  explicit ChildProcess(std::vector<std::string> command) {
+  /// @param output file that takes what it prints
+  explicit ChildProcess(std::vector<std::string> command, const std::string& output = "/dev/null") {
     std::vector<char*> arguments;
     for (std::string& word : command) arguments.push_back(word.data());
     arguments.push_back(nullptr);
     id_ = fork();
     if (id_ != 0) return;
     prctl(PR_SET_PDEATHSIG, SIGKILL);
-    const int nowhere = open("/dev/null", O_RDWR);
-    dup2(nowhere, STDIN_FILENO);
-    dup2(nowhere, STDOUT_FILENO);
-    dup2(nowhere, STDERR_FILENO);
+    const int printed = open(output.c_str(), O_RDWR | O_CREAT, 0600);
+    dup2(open("/dev/null", O_RDONLY), STDIN_FILENO);
+    dup2(printed, STDOUT_FILENO);
+    dup2(printed, STDERR_FILENO);
     execvp(arguments[0], arguments.data());
     _exit(127);
   }
@@ -37,6 +38,13 @@ class ChildProcess {
 
   void signal(int number) const {
     if (id_ > 0) kill(id_, number);
+  }
+  /// Waits for its own end. @return exit status; -1 when a signal ended it
+  int wait() {
+    int status = 0;
+    if (id_ <= 0 || waitpid(id_, &status, 0) != id_) return -1;
+    id_ = -1;
+    return WIFEXITED(status) ? WEXITSTATUS(status) : -1;
   }
   void end() {
     if (id_ <= 0) return;

@@ -492,6 +492,7 @@ void CameraDriver::onTimer() {
     // Not before there is a device: what is not known is not written to the parameters.
     config_server_ =
         std::make_unique<dynamic_reconfigure::Server<CameraConfig>>(config_mutex_, private_node_);
+    config_ = CameraConfig::__getDefault__();
     fromControls(controls, &config_);
     config_server_->updateConfig(config_);
     // The server calls back at once.

@@ -5,6 +5,8 @@
 
 int main(int argc, char** argv) {
   ros::init(argc, argv, "sim_rig");
+  // Without any handle ROS ends, and with it its log: the reason why would not be told.
+  const ros::NodeHandle keep;
   try {
     const ros::NodeHandle private_node("~");
     const omnister::SimRig rig(private_node,

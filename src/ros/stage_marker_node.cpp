@@ -5,6 +5,8 @@
 
 int main(int argc, char** argv) {
   ros::init(argc, argv, "stage_marker");
+  // Without any handle ROS ends, and with it its log: the reason why would not be told.
+  const ros::NodeHandle keep;
   try {
     const omnister::StageMarker marker{ros::NodeHandle(), ros::NodeHandle("~")};
     // One thread may wait for a service while others go on.

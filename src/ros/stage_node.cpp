@@ -5,6 +5,8 @@
 
 int main(int argc, char** argv) {
   ros::init(argc, argv, "stage");
+  // Without any handle ROS ends, and with it its log: the reason why would not be told.
+  const ros::NodeHandle keep;
   try {
     const ros::NodeHandle node, private_node("~");
     const omnister::StageParameters parameters = omnister::loadStageParameters(private_node);

@@ -5,6 +5,8 @@
 
 int main(int argc, char** argv) {
   ros::init(argc, argv, "view");
+  // Without any handle ROS ends, and with it its log: the reason why would not be told.
+  const ros::NodeHandle keep;
   try {
     omnister::ViewServer view{ros::NodeHandle(), ros::NodeHandle("~")};
     ros::spin();

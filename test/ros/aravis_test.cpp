@@ -5,6 +5,10 @@
 #include <rosgraph_msgs/Log.h>
 #include <std_srvs/Trigger.h>
 
+#include <filesystem>
+#include <fstream>
+#include <sstream>
+
 #include "child_process.h"
 #include "omnister/ros/camera_driver.h"
 #include "omnister/sim/gige_server.h"
@@ -145,6 +149,32 @@ TEST_F(AravisDriver, DiagnosticsTellOfTheLink) {
   EXPECT_TRUE(eventually([&] { return value("temperature [C]") == "41"; }, kLong));
   EXPECT_THAT(value("link"), HasSubstr("127.0.0.1"));
   EXPECT_EQ(value("frames incomplete"), "0");
+}
+
+TEST_F(AravisDriver, ANodeThatCannotStartSaysWhy) {
+  ros::NodeHandle().setParam("bad_camera/frame_rate", -1.0);
+  const std::string output = (folder_.path() / "output").string();
+  test::ChildProcess node(
+      {std::filesystem::read_symlink("/proc/self/exe").parent_path() / "camera_node",
+       "__name:=bad_camera"},
+      output);
+  EXPECT_EQ(node.wait(), 1);
+  std::stringstream text;
+  text << std::ifstream(output).rdbuf();
+  EXPECT_THAT(text.str(), testing::AllOf(HasSubstr("/bad_camera/frame_rate"), HasSubstr("-1")));
+}
+
+TEST_F(AravisDriver, WhatIsNotKnownOfACameraIsNotWrittenToItsParameters) {
+  serve();
+  parameters_.device = "aravis:127.0.0.1";
+  drive();
+  const dynamic_reconfigure::Config config = configure("gain", 3.0);
+  // Every value is the camera's own, or the default.
+  EXPECT_EQ(number(config, "gain"), 3.0);
+  EXPECT_EQ(number(config, "black_level"), 0.0);
+  EXPECT_EQ(number(config, "exposure_us"), 5000.0);
+  // With these the node starts again.
+  EXPECT_NO_THROW(loadCameraParameters(private_));
 }
 
 }  // namespace

@@ -101,7 +101,7 @@ class Node:
         want = self.frames + count
         while self.frames < want:
             if time.monotonic() > end or self.process.poll() is not None:
-                raise RuntimeError('no frames: %s' % self.diagnostics)
+                raise RuntimeError('no frames, exit status %s: %s' % (self.process.poll(), self.diagnostics))
             time.sleep(0.01)
 
     def close(self):
