@@ -16,6 +16,7 @@ constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 constexpr float kPi = 3.14159265f;
 constexpr float kLeastShare = 0.02f;  ///< of the field that must be weak and fillable
 constexpr int kWeakVariance = 49;     ///< of grey values where texture is weak
+constexpr int kUnlit = 16;            ///< grey values below which nothing is seen
 constexpr int kRadius = 2;            ///< over which a coarse surface is averaged [px of it]
 constexpr int kCoherent = 60;         ///< least region of a coarse level [px of it]
 constexpr float kSurface = 1.0f;      ///< steps that neighbours on a surface differ by at most
@@ -55,7 +56,8 @@ void averageSurface(cv::Mat* h, float near, int threads) {
   mean(rows, h, 0, 1);
 }
 
-/// Whether the grey values around a pixel hardly differ.
+/// Whether the grey values around a pixel hardly differ, though light falls there: what lies in the
+/// field of the lens model but beyond the image circle is no wall.
 bool isWeak(const cv::Mat& image, int x, int y) {
   constexpr int kReach = 6, kStep = 3;
   const int x0 = std::max(x - kReach, 0), x1 = std::min(x + kReach, image.cols - 1);
@@ -69,7 +71,7 @@ bool isWeak(const cv::Mat& image, int x, int y) {
       ++n;
     }
   }
-  return squares * n - sum * sum < kWeakVariance * n * n;
+  return sum >= kUnlit * n && squares * n - sum * sum < kWeakVariance * n * n;
 }
 
 /// Hypothesis of a coarse level at a pixel of the full image; NaN where it has none.
