@@ -501,6 +501,25 @@ void refuseUndetermined(const FitInput& input, const BundleState& state, const L
               "all parts of the image");
 }
 
+LensStructure richerThan(const LensStructure& structure) {
+  LensStructure richer = structure;
+  if (richer.grid > 0) {
+    richer.grid = std::min(12, richer.grid + 2);
+  } else if (richer.model == "spline") {
+    richer.knots = std::min(32, richer.knots + 4);
+  } else if (richer.model == "asphere") {
+    richer.even_terms = richer.even_terms + 1;
+    if (richer.even_terms > 3) {
+      richer.model = "spline";
+      richer.knots = 10;
+    }
+  } else {
+    richer.model = "asphere";
+    richer.even_terms = 1;
+  }
+  return richer;
+}
+
 namespace {
 
 /// Coverage of the image about the centre of distortion.
@@ -617,6 +636,23 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
   auto& notes = result.file.calibration.notes;
   notes["uncertainty_rms_px"] = fixed(uncertainty.rms_px, 4);
   notes["uncertainty_max_px"] = fixed(uncertainty.max_px, 4);
+  result.uncertainty_rms_px = uncertainty.rms_px;
+  result.uncertainty_max_px = uncertainty.max_px;
+  std::vector<double> distances;
+  for (const BundleView& view : bundleViews(input)) {
+    const Corner middle{Eigen::Vector2d::Zero(), Eigen::Vector3d::Zero(), Eigen::Vector2d::Zero()};
+    distances.push_back(cornerInCamera(view, fit.state, middle).norm());
+  }
+  std::nth_element(distances.begin(),
+                   distances.begin() + static_cast<std::ptrdiff_t>(distances.size() / 2),
+                   distances.end());
+  const double near = distances[distances.size() / 2];
+  for (const double times : {1.0, 2.0, 10.0, HUGE_VAL}) {
+    if (!(near > 0.0)) break;
+    const ProjectionField at =
+        projectionUncertaintyAt(*lens, covariance, input.image_size, near, times * near, 24);
+    result.depth_uncertainty.push_back({times * near, at.rms_px, at.max_px});
+  }
   if (uncertainty.rms_px > 1.0) {
     result.warnings.push_back(
         "the projection is uncertain by " + fixed(uncertainty.rms_px, 1) +
@@ -625,8 +661,10 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
   if (richer) {
     const ProjectionField bias =
         projectionDifference(*lens, *richer->state.lenses[0], input.image_size);
+    result.bias_rms_px = bias.rms_px;
+    result.bias_against = describeStructure(richer->structure);
     notes["bias_rms_px"] = fixed(bias.rms_px, 4);
-    notes["bias_against"] = describeStructure(richer->structure);
+    notes["bias_against"] = result.bias_against;
     if (bias.rms_px > 2.0 * uncertainty.rms_px + 1e-3) {
       result.warnings.push_back(
           "the model's bias exceeds its uncertainty: " + describeStructure(richer->structure) +
@@ -699,24 +737,9 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
                      lensCovariance(views, free, fit.state, fit.loss_px, 0, kDoubtSigmaPx),
                      input.image_size);
 
-  // The next richer model tells what the chosen one cannot say.
-  LensStructure richer = fit.structure;
-  if (richer.grid > 0) {
-    richer.grid = std::min(12, richer.grid + 2);
-  } else if (richer.model == "spline") {
-    richer.knots = std::min(32, richer.knots + 4);
-  } else if (richer.model == "asphere") {
-    richer.even_terms = richer.even_terms + 1;
-    if (richer.even_terms > 3) {
-      richer.model = "spline";
-      richer.knots = 10;
-    }
-  } else {
-    richer.model = "asphere";
-    richer.even_terms = 1;
-  }
   report(0.96, "estimating uncertainty");
-  const auto compared = refit(input, fit, richer);
+  // The next richer model tells what the chosen one cannot say.
+  const auto compared = refit(input, fit, richerThan(fit.structure));
   CalibrationResult result = assembleResult(prepared, selection, options, covariance, compared);
   if (input.stage) {
     const StageResult stage = judgeStage(input, fit, result.warnings);

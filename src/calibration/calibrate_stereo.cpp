@@ -7,7 +7,9 @@
 #include <map>
 
 #include "mono.h"
+#include "omnister/calibration/uncertainty.h"
 #include "omnister/common/error.h"
+#include "omnister/common/parallel.h"
 
 namespace omnister {
 
@@ -39,6 +41,7 @@ struct Single {
   Prepared prepared;
   Selection selection;
   std::map<int, std::size_t> place;  ///< view of the detections to view of the input
+  std::string bias_warning;          ///< empty where noise explains what a richer lens would change
 };
 
 Single fitAlone(const Detections& detections, const Board& board, const CalibrationOptions& options,
@@ -50,6 +53,21 @@ Single fitAlone(const Detections& detections, const Board& board, const Calibrat
     single.selection = selectStructure(single.prepared.input, first, options);
     const auto& index = single.prepared.input.index;
     for (std::size_t i = 0; i < index.size(); ++i) single.place[index[i]] = i;
+    const FitInput& input = single.prepared.input;
+    const Fit& fit = single.selection.fit;
+    const LensModel& lens = *fit.state.lenses[0];
+    if (const auto richer = refit(input, fit, richerThan(fit.structure))) {
+      const Eigen::MatrixXd covariance =
+          lensCovariance(bundleViews(input), input.freedom(), fit.state, fit.loss_px, 0);
+      const double noise = projectionUncertainty(lens, covariance, input.image_size, 24).rms_px;
+      const double bias =
+          projectionDifference(lens, *richer->state.lenses[0], input.image_size, 24).rms_px;
+      if (bias > 2.0 * noise + 1e-3) {
+        single.bias_warning =
+            "the model's bias exceeds its uncertainty: " + describeStructure(richer->structure) +
+            " differs by " + fixed(bias, 3) + " px RMS, noise explains " + fixed(noise, 3) + " px";
+      }
+    }
     return single;
   } catch (const Error& error) {
     throw Error(std::string(side) + " camera: " + error.what());
@@ -285,6 +303,7 @@ StereoCalibrationResult calibrateStereo(const Detections& left, const Detections
                        input.image_size);
     CalibrationResult camera_result =
         assembleResult(single.prepared, selection, options, covariance, std::nullopt);
+    if (!single.bias_warning.empty()) camera_result.warnings.push_back(single.bias_warning);
     camera_result.file.camera_name = camera == 0 ? "left" : "right";
     return camera_result;
   };
@@ -301,6 +320,52 @@ StereoCalibrationResult calibrateStereo(const Detections& left, const Detections
     count += camera->points;
   }
   result.rms_px = std::sqrt(squares / count);
+  if (options.folds > 0) {
+    struct Sum {
+      double squares = 0.0;
+      double count = 0.0;
+      bool failed = false;
+    };
+    std::vector<Sum> sums(static_cast<std::size_t>(options.folds));
+    parallelFor(0, sums.size(), options.threads, [&](std::size_t fold) {
+      std::vector<BundleView> known;
+      std::vector<std::size_t> unseen;
+      for (std::size_t i = 0; i < boards.size(); ++i) {
+        if (!used[i]) continue;
+        const bool held_out = boards[i].view % options.folds == static_cast<int>(fold);
+        if (held_out && i < pairs.size()) unseen.push_back(i);
+        if (held_out) continue;
+        for (const BundleView& view : viewsOf(i)) known.push_back(view);
+      }
+      if (unseen.empty()) return;
+      BundleState without = state;
+      BundleOptions refit_options = bundle;
+      refit_options.tolerance = 1e-8;
+      if (!adjust(known, refit_options, without)) {
+        sums[fold].failed = true;
+        return;
+      }
+      for (const std::size_t i : unseen) {
+        const std::vector<BundleView> pair = viewsOf(i);
+        refinePose(pair, 0.0, without);
+        for (const BundleView& view : pair) {
+          for (const Eigen::Vector2d& residual : residualsOf(view, without)) {
+            sums[fold].squares += residual.squaredNorm();
+            sums[fold].count += 1.0;
+          }
+        }
+      }
+    });
+    Sum total;
+    for (const Sum& sum : sums) {
+      total.squares += sum.squares;
+      total.count += sum.count;
+      total.failed = total.failed || sum.failed;
+    }
+    if (!total.failed && total.count > 0.0) {
+      result.holdout_rms_px = std::sqrt(total.squares / total.count);
+    }
+  }
   for (std::size_t i = 0; i < pairs.size(); ++i) {
     if (used[i]) continue;
     result.warnings.push_back("pair '" + left.views[static_cast<std::size_t>(boards[i].view)].name +

@@ -52,6 +52,9 @@ Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const Bundl
 /// [px].
 inline constexpr double kDoubtSigmaPx = 0.05;
 
+/// The next richer structure, to compare with.
+LensStructure richerThan(const LensStructure& structure);
+
 /// Lens file, view results, warnings and refusals of a finished fit.
 /// @param richer a fit of a richer structure to compare with, if there is one
 CalibrationResult assembleResult(const Prepared& prepared, const Selection& selection,

@@ -16,6 +16,7 @@ struct GridPoint {
   std::size_t index;  ///< in the grid
   Eigen::Vector3d bearing;
   Eigen::Vector2d pixel;
+  Jacobian23 d_bearing;
   Eigen::Matrix<double, 2, 3> d_rotation;  ///< d(pixel)/d(small rotation of the camera)
   JacobianParams d_parameters;
 };
@@ -44,9 +45,8 @@ std::vector<GridPoint> gridOf(const LensModel& lens, cv::Size size, int cols,
       const auto bearing = lens.unproject(point.pixel);
       if (!bearing) continue;
       point.bearing = *bearing;
-      Jacobian23 d_bearing;
-      if (!lens.project(point.bearing, &d_bearing, &point.d_parameters)) continue;
-      point.d_rotation = -d_bearing * cross(point.bearing);
+      if (!lens.project(point.bearing, &point.d_bearing, &point.d_parameters)) continue;
+      point.d_rotation = -point.d_bearing * cross(point.bearing);
       points.push_back(std::move(point));
     }
   }
@@ -88,6 +88,40 @@ ProjectionField projectionUncertainty(const LensModel& lens, const Eigen::Matrix
     const Eigen::MatrixXd d = point.d_parameters + point.d_rotation * answer;
     const double variance = (d * covariance * d.transpose()).trace();
     field.sigma_px[point.index] = std::sqrt(std::max(0.0, variance));
+  }
+  summarize(field);
+  return field;
+}
+
+ProjectionField projectionUncertaintyAt(const LensModel& lens, const Eigen::MatrixXd& covariance,
+                                        cv::Size image_size, double board_distance, double distance,
+                                        int cols) {
+  const Eigen::Index size = lens.parameters().size();
+  if (covariance.rows() != size || covariance.cols() != size || !(board_distance > 0.0) ||
+      !(distance > 0.0)) {
+    throw Error("uncertainty at a distance needs a covariance of the lens and positive distances");
+  }
+  ProjectionField field;
+  const auto points = gridOf(lens, image_size, cols, field);
+  // Rotation, and shift in units of the boards' distance.
+  const auto movementOf = [](const GridPoint& point, double nearness) {
+    Eigen::Matrix<double, 2, 6> d;
+    d << point.d_rotation, nearness * point.d_bearing;
+    return d;
+  };
+  Eigen::Matrix<double, 6, 6> normal = Eigen::Matrix<double, 6, 6>::Zero();
+  Eigen::MatrixXd mixed = Eigen::MatrixXd::Zero(6, size);
+  for (const GridPoint& point : points) {
+    const Eigen::Matrix<double, 2, 6> d = movementOf(point, 1.0);
+    normal += d.transpose() * d;
+    mixed += d.transpose() * point.d_parameters;
+  }
+  const Eigen::MatrixXd answer = -normal.ldlt().solve(mixed);
+  for (const GridPoint& point : points) {
+    const Eigen::MatrixXd d =
+        point.d_parameters + movementOf(point, board_distance / distance) * answer;
+    field.sigma_px[point.index] =
+        std::sqrt(std::max(0.0, (d * covariance * d.transpose()).trace()));
   }
   summarize(field);
   return field;

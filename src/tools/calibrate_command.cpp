@@ -80,6 +80,20 @@ void run(const Arguments& arguments) {
   json["height_px"] = result.height_px;
   json["height_sigma_px"] = nullptr;
   if (std::isfinite(result.height_sigma_px)) json["height_sigma_px"] = result.height_sigma_px;
+  json["uncertainty_rms_px"] = result.uncertainty_rms_px;
+  json["uncertainty_max_px"] = result.uncertainty_max_px;
+  auto& depths = json["uncertainty_at_depth"] = nlohmann::ordered_json::array();
+  for (const DepthUncertainty& depth : result.depth_uncertainty) {
+    nlohmann::ordered_json row;
+    row["distance_m"] = nullptr;  // infinity
+    if (std::isfinite(depth.distance)) row["distance_m"] = depth.distance;
+    row["rms_px"] = depth.rms_px;
+    row["max_px"] = depth.max_px;
+    depths.push_back(row);
+  }
+  json["bias_rms_px"] = nullptr;
+  if (result.bias_rms_px) json["bias_rms_px"] = *result.bias_rms_px;
+  json["bias_against"] = result.bias_against;
   if (result.stage) {
     const StageResult& stage = *result.stage;
     json["stage_axis"] = {stage.axis.x(), stage.axis.y(), stage.axis.z()};

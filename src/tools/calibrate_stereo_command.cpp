@@ -64,6 +64,7 @@ void run(const Arguments& arguments) {
   inputs.insert(inputs.end(), {arguments.left_detections, arguments.right_detections,
                                arguments.common.target_file});
   checkOutputs(inputs, {out_left, out_right, arguments.out_rig});
+  checkReportFolder(arguments.common.report_folder);
   Detections left =
       gatherDetections(arguments.common, arguments.left_images, arguments.left_detections, true);
   Detections right =
@@ -87,6 +88,8 @@ void run(const Arguments& arguments) {
     json["holdout_rms_px"] =
         std::sqrt((l * l * result.left.points + r * r * result.right.points) / points);
   }
+  json["joint_holdout_rms_px"] = nullptr;
+  if (result.holdout_rms_px) json["joint_holdout_rms_px"] = *result.holdout_rms_px;
   addFigures(json, {&result.left, &result.right});
   json["max_theta_rad"] =
       std::max(result.left.file.lens->maxTheta(), result.right.file.lens->maxTheta());

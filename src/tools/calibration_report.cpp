@@ -77,6 +77,27 @@ std::string calibrationReport(const std::string& title, const Detections& detect
   html += row({"half field of view", fixed(lens.maxTheta() * 180 / kPi, 1) + " degrees"});
   html += row({"board warp", fixed(result.board_warp[0], 6) + ", " +
                                  fixed(result.board_warp[1], 6) + " board units"});
+  html +=
+      row({"height of the surface over its centre (R0)",
+           fixed(result.height_px, 4) + " &plusmn; " + fixed(result.height_sigma_px, 4) + " px"});
+  for (const DepthUncertainty& depth : result.depth_uncertainty) {
+    html += row({"projection uncertainty at " + (std::isfinite(depth.distance)
+                                                     ? fixed(depth.distance, 3) + " board units"
+                                                     : std::string("infinity")),
+                 fixed(depth.rms_px, 4) + " px RMS, at most " + fixed(depth.max_px, 4) + " px"});
+  }
+  if (result.bias_rms_px) {
+    html += row({"difference from " + escaped(result.bias_against),
+                 fixed(*result.bias_rms_px, 4) + " px RMS"});
+  }
+  if (result.stage) {
+    const Eigen::Vector3d& axis = result.stage->axis;
+    html += row({"axis of the stage", fixed(axis.x(), 6) + ", " + fixed(axis.y(), 6) + ", " +
+                                          fixed(axis.z(), 6) + " &plusmn; " +
+                                          fixed(result.stage->axis_sigma_rad, 6) + " rad"});
+    html += row({"the stage's unit by the board's", fixed(result.stage->scale, 6) + " &plusmn; " +
+                                                        fixed(result.stage->scale_sigma, 6)});
+  }
   const auto names = lens.parameterNames();
   const Eigen::VectorXd values = lens.parameters();
   for (std::size_t i = 0; i < names.size(); ++i) {

@@ -55,6 +55,13 @@ struct StageResult {
   int views = 0;   ///< views of these
 };
 
+/// Projection uncertainty of points at a distance, see projectionUncertaintyAt().
+struct DepthUncertainty {
+  double distance = 0.0;  ///< board units; may be infinite
+  double rms_px = 0.0;
+  double max_px = 0.0;
+};
+
 struct CalibrationResult {
   LensFile file;                               ///< lens, covariance and record, ready to write
   Eigen::Vector2d board_warp = Eigen::Vector2d::Zero();  ///< see calibrate()
@@ -65,6 +72,11 @@ struct CalibrationResult {
   int points = 0;
   double height_px = 0.0;        ///< of the surface over its centre, Johnson's R0: pixels per radian there
   double height_sigma_px = 0.0;  ///< its standard deviation; NaN where it cannot be told
+  double uncertainty_rms_px = 0.0;  ///< of directions, over the image (projectionUncertainty())
+  double uncertainty_max_px = 0.0;
+  std::vector<DepthUncertainty> depth_uncertainty;  ///< at the boards, 2 and 10 times as far, infinity
+  std::optional<double> bias_rms_px;  ///< difference from the next richer model
+  std::string bias_against;           ///< that model
   std::optional<StageResult> stage;            ///< where views had stage positions
   std::vector<std::string> warnings;           ///< for a person: bad images by name, poor coverage, …
 };
@@ -81,6 +93,9 @@ struct StereoCalibrationResult {
   CalibrationResult right;
   Pose T_left_right;                           ///< maps right (displaced) into left (reference)
   double rms_px = 0.0;                         ///< joint, over the corners of both cameras
+  /// Over pairs unseen by lenses, warp and the pose between the cameras, whose board pose alone was
+  /// refitted to both images; where folds were asked for.
+  std::optional<double> holdout_rms_px;
   std::vector<std::string> warnings;
 };
 

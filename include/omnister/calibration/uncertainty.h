@@ -29,6 +29,14 @@ struct ProjectionField {
 ProjectionField projectionUncertainty(const LensModel& lens, const Eigen::MatrixXd& covariance,
                                       cv::Size image_size, int cols = 40);
 
+/// The same for points at a distance, where a small shift of the camera can be told from a rotation:
+/// the movement that is taken out is the one that answers best at the distance of the boards, since
+/// their poses have answered there. Near them the projection is known best.
+/// @param board_distance  @param distance of the points, may be infinite; both in one unit, > 0
+ProjectionField projectionUncertaintyAt(const LensModel& lens, const Eigen::MatrixXd& covariance,
+                                        cv::Size image_size, double board_distance, double distance,
+                                        int cols = 40);
+
 /// Distance between the projections of two lenses over the field of `lens`, after the best rotation
 /// between them [px].
 ProjectionField projectionDifference(const LensModel& lens, const LensModel& other,
