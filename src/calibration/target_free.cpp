@@ -438,8 +438,9 @@ void growStructure(Reconstruction& scene, bool scale_known, int threads) {
     if (now.model == "asphere" && now.even_terms < 3) {
       candidates.push_back(now);
       ++candidates.back().even_terms;
-    } else if (now.model == "asphere") {
-      // Some lenses turn up at the rim as no compact surface does.
+    } else if (now.model == "asphere" && scale_known) {
+      // Some lenses turn up at the rim as no compact surface does. One scan alone is too weak to
+      // tell that from a stage that is not quite straight.
       candidates.push_back(now);
       candidates.back().model = "spline";
       candidates.back().even_terms = 0;

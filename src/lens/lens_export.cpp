@@ -29,10 +29,16 @@ constexpr double kPi = 3.14159265358979323846;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 // Models this near are as good as exact: the first of them is taken [px].
 constexpr double kExact = 1e-3;
+// Of models this near none is nearer: the first is taken [px].
+constexpr double kSame = 1e-5;
+// A sensor is sheared or turned from this share of its scale: half a pixel at the edge of a large
+// image.
+constexpr double kSkew = 2e-4;
 // A higher degree has to lower the residual to this part.
 constexpr double kEarned = 0.8;
-constexpr int kLeastDegree = 4;  // what OCamCalib itself fits
-constexpr int kMostDegree = 8;   // more go astray just beyond the field
+constexpr double kLeastField = 5.0 * kPi / 180.0;  // half field of view [rad]
+constexpr int kLeastDegree = 4;                    // what OCamCalib itself fits
+constexpr int kMostDegree = 8;                     // more go astray just beyond the field
 constexpr int kMostInverseDegree = 18;
 
 struct Samples {
@@ -551,13 +557,21 @@ const std::vector<std::string>& exportFormats() {
 }
 
 const std::vector<std::string>& kalibrExportModels() {
-  static const std::vector<std::string> kNames{"eucm", "ds", "omni-radtan", "pinhole-equidistant"};
+  static const std::vector<std::string> kNames{"pinhole-equidistant", "eucm", "ds", "omni-radtan"};
   return kNames;
 }
 
-LensExport exportLens(const LensFile& file, std::string_view format, std::string_view model) {
+LensExport exportLens(const LensFile& file, std::string_view format, std::string_view model,
+                      std::optional<double> narrowed_theta) {
   const LensModel& lens = *file.lens;
-  const double max_theta = fieldWithinImage(lens, file.image_size);
+  double max_theta = fieldWithinImage(lens, file.image_size);
+  if (narrowed_theta) {
+    if (!(*narrowed_theta >= kLeastField)) {
+      throw Error("a field of " + formatNumber(*narrowed_theta * 180.0 / kPi) +
+                  " degrees off the axis is too narrow, expected 5 or more");
+    }
+    max_theta = std::min(max_theta, *narrowed_theta);
+  }
   Jacobian23 slope;
   const auto center = lens.project({0.0, 0.0, 1.0}, &slope);
   if (!center || !(slope(0, 0) > 0.0) || !(slope(1, 1) > 0.0)) {
@@ -574,9 +588,9 @@ LensExport exportLens(const LensFile& file, std::string_view format, std::string
   out.max_theta_rad = max_theta;
   out.residual_rms_px = out.residual_max_px = kInfinity;
   // Takes a candidate that is clearly better.
-  const auto consider = [&](const std::optional<Written>& written, double part) {
+  const auto consider = [&](const std::optional<Written>& written, double part, double exact) {
     const Measure found = written ? measureWritten(task, *written) : Measure{};
-    if (found.rms < part * out.residual_rms_px && out.residual_rms_px > kExact) {
+    if (found.rms < part * out.residual_rms_px && out.residual_rms_px > exact) {
       out.text = written->text;
       out.model = written->name;
       out.residual_rms_px = found.rms;
@@ -591,15 +605,15 @@ LensExport exportLens(const LensFile& file, std::string_view format, std::string
     }
     for (const std::string& name : names) {
       if (!model.empty() && name != model) continue;
-      out.tried.emplace_back(name, consider(writeKalibr(task, name), 1.0));
+      out.tried.emplace_back(name, consider(writeKalibr(task, name), 1.0, kSame));
     }
   } else if (format == "ocam") {
     for (int degree = kLeastDegree; degree <= kMostDegree; ++degree) {
-      consider(writeOcam(task, degree), kEarned);
+      consider(writeOcam(task, degree), kEarned, kExact);
     }
     out.tried.emplace_back("ocam", out.residual_rms_px);
   } else if (format == "equidistant") {
-    out.tried.emplace_back("equidistant", consider(writeEquidistant(task), 1.0));
+    out.tried.emplace_back("equidistant", consider(writeEquidistant(task), 1.0, kExact));
   } else {
     throw Error("no export format is called \"" + printable(format) + "\"");
   }
@@ -609,7 +623,46 @@ LensExport exportLens(const LensFile& file, std::string_view format, std::string
                 formatNumber(std::round(max_theta * 1800.0 / kPi) / 10.0) +
                 " degrees off the axis");
   }
+  // Only OCamCalib has an affinity with shear and turn.
+  const double skew = std::max(std::abs(slope(0, 1)), std::abs(slope(1, 0))) / slope(0, 0);
+  if (out.model != "ocam" && skew > kSkew) {
+    out.remarks.push_back("the sensor's shear or turn (" +
+                          formatNumber(std::round(1e6 * slope(0, 1) / slope(0, 0)) / 1e6) + ", " +
+                          formatNumber(std::round(1e6 * slope(1, 0) / slope(0, 0)) / 1e6) +
+                          " of its scale) is left out, " + out.model +
+                          " has none: that is part of the residual; --format ocam can say it");
+  }
   return out;
+}
+
+std::optional<LensExport> exportWidest(const LensFile& file, std::string_view format,
+                                       std::string_view model, double max_residual_px) {
+  const auto attempt = [&](double theta) -> std::optional<LensExport> {
+    try {
+      LensExport made = exportLens(file, format, model, theta);
+      if (made.residual_rms_px <= max_residual_px) return made;
+    } catch (const Error&) {
+      // No model of the format over this field.
+    }
+    return std::nullopt;
+  };
+  const double whole = fieldWithinImage(*file.lens, file.image_size);
+  double good = 10.0 * kPi / 180.0;
+  if (good >= whole) return attempt(whole);
+  std::optional<LensExport> best = attempt(good);
+  if (!best) return std::nullopt;
+  if (auto all = attempt(whole)) return all;
+  double bad = whole;
+  while (bad - good > 0.25 * kPi / 180.0) {
+    const double middle = 0.5 * (good + bad);
+    if (auto made = attempt(middle)) {
+      best = std::move(made);
+      good = middle;
+    } else {
+      bad = middle;
+    }
+  }
+  return best;
 }
 
 }  // namespace omnister

@@ -26,6 +26,7 @@ struct Options {
   double max_residual_px = 0.5;
   int knots = 24;
   int even_terms = 3;
+  bool model_given = false;
 };
 
 std::string round(double value, int digits) {
@@ -43,9 +44,45 @@ std::string today() {
   return text;
 }
 
+/// A lens file needs no import: it goes through as it is, never refitted.
+bool isLensFile(const std::string& text) {
+  std::size_t at = 0;
+  while ((at = text.find("lens_surface:", at)) != std::string::npos) {
+    if (at == 0 || text[at - 1] == '\n') return true;
+    ++at;
+  }
+  return false;
+}
+
+void passThrough(const Options& options, bool json) {
+  const LensFile file = readLensFile(options.file);
+  if (options.model_given && options.model != file.lens->model()) {
+    throw InputError(options.file, "lens_surface.model",
+                     "is a lens file already, with the model " + std::string(file.lens->model()) +
+                         ": --model " + options.model +
+                         " would refit it; leave --model out, or give --format camera_info to "
+                         "import its standard part alone");
+  }
+  writeLensFile(options.out, file);
+  say("a lens file already: passed through unchanged");
+  nlohmann::ordered_json result;
+  result["residual_rms_px"] = 0.0;
+  result["residual_max_px"] = 0.0;
+  result["model"] = file.lens->model();
+  result["format"] = "lens_surface";
+  result["camera"] = file.camera_name;
+  result["max_theta_rad"] = file.lens->maxTheta();
+  result["out"] = options.out;
+  printResult(json, result);
+}
+
 void run(const Options& options, bool json) {
   checkOutputs({options.file}, {options.out});
   const std::string text = readFile(options.file, kMaxBytes);
+  if (options.format == "auto" && isLensFile(text)) {
+    passThrough(options, json);
+    return;
+  }
   const ForeignCamera camera =
       readForeignCamera(text, options.file, options.format, options.camera);
   for (const std::string& remark : camera.remarks) say(remark);
@@ -105,9 +142,9 @@ void addImport(CLI::App& app) {
       ->check(CLI::IsMember(foreignFormats()))
       ->capture_default_str();
   command->add_option("--camera", options->camera, "Camera of a Kalibr camchain, e.g. cam1");
-  command->add_option("--model", options->model, "Lens surface")
-      ->check(CLI::IsMember(lensModelNames()))
-      ->capture_default_str();
+  CLI::Option* model = command->add_option("--model", options->model, "Lens surface")
+                           ->check(CLI::IsMember(lensModelNames()))
+                           ->capture_default_str();
   command->add_option("--out", options->out, "Lens file to write")->required();
   command
       ->add_option("--max-residual", options->max_residual_px,
@@ -121,7 +158,10 @@ void addImport(CLI::App& app) {
       ->check(CLI::Range(0, 3))
       ->capture_default_str();
   const bool& json = addJsonFlag(*command);
-  command->callback([options, &json] { run(*options, json); });
+  command->callback([options, model, &json] {
+    options->model_given = model->count() > 0;
+    run(*options, json);
+  });
 }
 
 }  // namespace omnister::tools

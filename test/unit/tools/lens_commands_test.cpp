@@ -205,6 +205,73 @@ TEST_F(LensCommands, ALineThatIsNoNumbersIsAnErrorThatNamesIt) {
   }
 }
 
+TEST_F(LensCommands, ImportPassesALensFileThrough) {
+  LensStructure structure;
+  structure.model = "conic";
+  LensFile file;
+  file.image_size = {640, 480};
+  file.lens = makeLens(structure, {310.0, 250.0}, 150.0, 1.5);
+  writeLensFile(path("conic.yaml"), file);
+  const auto json =
+      object(run({"import", path("conic.yaml"), "--out", path("passed.yaml"), "--json"}));
+  EXPECT_EQ(json.at("model"), "conic");
+  EXPECT_EQ(json.at("residual_rms_px").get<double>(), 0.0);
+  EXPECT_EQ(readLensFile(path("passed.yaml")).lens->parameters(), file.lens->parameters());
+  const auto refused =
+      run({"import", path("conic.yaml"), "--model", "spline", "--out", path("refit.yaml")});
+  EXPECT_EQ(refused.code, 1);
+  EXPECT_THAT(refused.err, HasSubstr("lens file already"));
+  EXPECT_FALSE(std::filesystem::exists(path("refit.yaml")));
+}
+
+TEST_F(LensCommands, ExportNarrowsWhereTheWholeFieldCannotBeSaid) {
+  // Kannala and Brandt's four terms cannot follow a surface that turns up at the rim.
+  LensStructure structure;
+  structure.model = "spline";
+  structure.knots = 10;
+  LensFile file;
+  file.image_size = {1280, 960};
+  file.lens = makeLens(structure, {640.0, 480.0}, 300.0, 1.7);
+  Eigen::VectorXd numbers = file.lens->parameters();
+  numbers[numbers.size() - 1] += 30.0;
+  numbers[numbers.size() - 2] += 2.0;
+  file.lens = file.lens->withParameters(numbers);
+  ASSERT_TRUE(file.lens);
+  writeLensFile(path("rim.yaml"), file);
+  const auto refused = run({"export", path("rim.yaml"), "--format", "equidistant", "--out",
+                            path("rim_info.yaml"), "--max-residual", "0.1"});
+  EXPECT_EQ(refused.code, 1);
+  EXPECT_THAT(refused.err, HasSubstr("--narrow writes that"));
+  EXPECT_FALSE(std::filesystem::exists(path("rim_info.yaml")));
+  const Outcome narrowed =
+      run({"export", path("rim.yaml"), "--format", "equidistant", "--out", path("rim_info.yaml"),
+           "--max-residual", "0.1", "--narrow", "--json"});
+  ASSERT_EQ(narrowed.code, 0) << narrowed.err;
+  const auto json = nlohmann::json::parse(narrowed.out);
+  EXPECT_LE(json.at("residual_rms_px").get<double>(), 0.1);
+  EXPECT_GT(json.at("max_theta_rad").get<double>(), 0.8);
+  EXPECT_LT(json.at("max_theta_rad").get<double>(), 1.7);
+  EXPECT_THAT(narrowed.err, HasSubstr("degrees off the axis are said"));
+  const Outcome given = run({"export", path("rim.yaml"), "--format", "equidistant", "--out",
+                             path("rim_info.yaml"), "--max-theta", "45", "--json"});
+  ASSERT_EQ(given.code, 0) << given.err;
+  EXPECT_NEAR(nlohmann::json::parse(given.out).at("max_theta_rad").get<double>(), M_PI / 4, 1e-9);
+}
+
+TEST_F(LensCommands, ExportNamesShearThatAModelCannotSay) {
+  const std::map<std::string, std::vector<double>> parameters{
+      {"f", {310}}, {"alpha", {0.6}}, {"beta", {1.1}}, {"p", {0.004}}, {"q", {0.003}}};
+  LensFile file;
+  file.image_size = {1280, 960};
+  file.lens = makeLens("conic", {640.0, 480.0}, parameters, 1.5, "made");
+  writeLensFile(path("shear.yaml"), file);
+  const Outcome outcome = run({"export", path("shear.yaml"), "--format", "kalibr", "--out",
+                               path("shear_chain.yaml"), "--max-residual", "5", "--json"});
+  ASSERT_EQ(outcome.code, 0) << outcome.err;
+  EXPECT_THAT(outcome.err, HasSubstr("shear"));
+  EXPECT_FALSE(nlohmann::json::parse(outcome.out).at("remarks").empty());
+}
+
 TEST_F(LensCommands, ImportWritesALensFile) {
   const auto json =
       object(run({"import", path("chain.yaml"), "--out", path("imported.yaml"), "--json"}));
