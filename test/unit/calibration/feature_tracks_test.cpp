@@ -6,12 +6,14 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <filesystem>
 #include <set>
 #include <string>
 
 #include "omnister/calibration/target_free.h"
 #include "omnister/common/error.h"
 #include "omnister/sim/renderer.h"
+#include "unit/stereo/real_data.h"
 
 namespace omnister {
 namespace {
@@ -197,6 +199,34 @@ TEST(FeatureTracks, LensFromARenderedRoomInFull) {
   std::printf("one scan, free scale fitted: %.4f deg RMS, %.3f px, %d points\n", best,
               result.rms_px, result.points);
   EXPECT_LT(best, 0.03);
+}
+
+// A car that turns by half a degree on its way is no stage: what comes of it, up to the one scale.
+TEST(FeatureTracks, LensFromACarThatSlidesSideways) {
+  const char* full = std::getenv("OMNISTER_FULL_TESTS");
+  if (full == nullptr || std::string(full) != "ON") GTEST_SKIP() << "runs with ./run test --full";
+  if (!std::filesystem::exists(test::dataFolder("planesweep_car_fisheye"))) {
+    GTEST_SKIP() << "planesweep_car_fisheye is not there";
+  }
+  const test::CarSequence car = test::readCarSequence("left");
+  const std::size_t middle = car.images.size() / 2;
+  const Eigen::Vector3d way =
+      car.T_ref_disp(middle, car.images.size() - 1).translation().normalized();
+  StageScan scan;
+  for (std::size_t i = middle - 2; i <= middle + 2; ++i) {
+    scan.images.push_back(car.image(i));
+    scan.positions_m.push_back(i == middle ? 0.0
+                                           : car.T_ref_disp(middle, i).translation().dot(way));
+  }
+  TrackingOptions tracking;
+  tracking.features_per_scan = 2000;
+  const TargetFreeResult result = calibrateTargetFree({scan}, tracking, {});
+  EXPECT_EQ(result.scale, SurfaceScale::kFree);
+  const double best = bestAngleRms(*car.lens.lens, *result.file.lens, car.size);
+  std::printf("car, free scale fitted: %.3f deg RMS, %.3f px, %d points\n", best, result.rms_px,
+              result.points);
+  EXPECT_LT(best, 1.2);
+  EXPECT_LT(std::acos(std::min(1.0, result.file.stage_axis->dot(way))), 2.0 * kDegree);
 }
 
 }  // namespace
