@@ -462,7 +462,7 @@ TEST_F(GrblStageTest, SaysWhatAnsweredInsteadOfAStage) {
 
 int movesToMake() {
   const char* full = getenv("OMNISTER_FULL_TESTS");
-  return full != nullptr && std::string(full) == "ON" ? 1000 : 20;
+  return full != nullptr && std::string(full) == "ON" ? 1000 : 12;
 }
 
 struct Tally {
