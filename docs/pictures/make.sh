@@ -33,7 +33,6 @@ cat >"$work/pictures.launch" <<XML
     <arg name="gui" value="false"/>
     <arg name="store" value="$work/store"/>
     <arg name="port" value="$work/stage"/>
-    <arg name="camera_address" value="127.0.0.9"/>
   </include>
   <include file="$share/launch/rviz.launch"><arg name="max_m" value="0.4"/></include>
 </launch>
