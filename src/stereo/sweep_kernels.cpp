@@ -756,11 +756,11 @@ void TriangulateRow(TriangulateJob* job) {
     const auto steep = hn::Max(load(job->steep + x), hn::Set(d, 1.0f));
     const auto one = hn::Set(d, 1.0f);
     // Spread of the least: noise of the costs over the slope beside it.
-    const auto sigma_h = hn::Mul(
-        hn::Add(
-            hn::Div(hn::Mul(hn::Sqrt(hn::Add(cost, hn::Set(d, 20.0f))), hn::Set(d, 0.35f)), steep),
-            hn::Set(d, 0.05f)),
-        hn::Set(d, job->step_h));
+    const auto sigma_h = hn::Mul(hn::Add(hn::Div(hn::Mul(hn::Sqrt(hn::Add(cost, hn::Set(d, 20.0f))),
+                                                         hn::Set(d, kSigmaOfCost)),
+                                                 steep),
+                                         hn::Set(d, 0.05f)),
+                                 hn::Set(d, job->step_h));
     auto range = nan, sigma = nan;
     if (job->inverse) {
       // 1 / rho to range along the ray: rho / sin(theta), and 1 / sin(theta) from -cot(theta).

@@ -189,6 +189,10 @@ void rejectRow(RejectJob* job);
 /// @param rows above, here, below; one element before and behind must be readable
 void medianRow(const float* const rows[3], int count, float* out);
 
+/// Spread of a hypothesis [columns] times the slope of its cost over the root of the cost; as
+/// measured on rendered scenes with image noise of one grey level.
+inline constexpr float kSigmaOfCost = 0.44f;
+
 struct TriangulateJob {
   int count = 0;
   bool inverse = false;  ///< h is 1 / rho, else the parallax angle

@@ -49,7 +49,7 @@ constexpr std::int32_t kUnclaimed = std::numeric_limits<std::int32_t>::max();
 constexpr float kEdgeJump = 1.5f;         ///< columns between surfaces at an edge
 constexpr int kSpeckle = 100;             ///< regions of fewer pixels go,
 constexpr int kSpeckleShare = 3000;       ///< or of less than this part of the image
-constexpr float kMatchedVariance = 9.0f;  ///< of matches in weak texture, times what costs say
+constexpr float kMatchedVariance = 6.0f;  ///< of matches in weak texture, times what costs say
 constexpr int kFilledCost = 300;          ///< of matches taken from coarser levels
 constexpr float kWorstShare = 0.34f;      ///< of it, that a match may cost; chance gives a half
 
@@ -944,7 +944,7 @@ class SweepMatcher : public SweepPair {
     job.certainty = [&](int x, int y) {
       const float cost = static_cast<float>(cost_.at<std::uint16_t>(y, x));
       const float steep = std::max<float>(steep_.at<std::uint16_t>(y, x), 1.0f);
-      const float spread = (0.35f * std::sqrt(cost + 20.0f) / steep + 0.05f) * finest_step_;
+      const float spread = (kSigmaOfCost * std::sqrt(cost + 20.0f) / steep + 0.05f) * finest_step_;
       return 1 / (kMatchedVariance * spread * spread);
     };
     job.step = finest_step_;
@@ -969,7 +969,7 @@ class SweepMatcher : public SweepPair {
         if (std::isnan(spread[x])) continue;
         cost[x] = kFilledCost;
         const float columns = std::max(spread[x] / finest_step_ - 0.05f, 0.02f);
-        const float slope = 0.35f * std::sqrt(kFilledCost + 20.0f) / columns;
+        const float slope = kSigmaOfCost * std::sqrt(kFilledCost + 20.0f) / columns;
         steep[x] = static_cast<std::uint16_t>(std::clamp(slope, 1.0f, 1000.0f));
       }
     });
