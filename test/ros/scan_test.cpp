@@ -124,7 +124,7 @@ TEST_F(Scan, TagsImagesAtStopsAndKeepsThemAsARecording) {
   goal.start = 0.0;
   goal.stop = 0.2;
   goal.step = 0.1;
-  goal.speed = 0.2;
+  goal.speed = 0.1;
   goal.frames = 2;
   goal.folder = (folder_.path() / "scan").string();
   ASSERT_EQ(run(goal), SimpleClientGoalState::SUCCEEDED) << client_.getResult()->message;
@@ -170,11 +170,11 @@ TEST_F(Scan, SweepsTagImagesInMotion) {
   ScanGoal goal;
   goal.start = 0.02;
   goal.stop = 0.25;
-  goal.speed = 0.1;
+  goal.speed = 0.06;
   goal.folder = (folder_.path() / "sweep").string();
   ASSERT_EQ(run(goal), SimpleClientGoalState::SUCCEEDED) << client_.getResult()->message;
   const device::Recording recording = device::readRecording(goal.folder);
-  ASSERT_GE(recording.frames.size(), 5u);
+  ASSERT_GE(recording.frames.size(), 3u);
   EXPECT_EQ(recording.frames.size(), client_.getResult()->frames);
   int moving = 0;
   for (const auto& frame : recording.frames) {
@@ -187,7 +187,7 @@ TEST_F(Scan, SweepsTagImagesInMotion) {
       ++moving;
     }
   }
-  EXPECT_GE(moving, 3);
+  EXPECT_GE(moving, 2);
 }
 
 TEST_F(Scan, CancelReallyStopsTheStage) {
