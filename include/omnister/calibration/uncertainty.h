@@ -32,7 +32,8 @@ ProjectionField projectionUncertainty(const LensModel& lens, const Eigen::Matrix
 /// The same for points at a distance, where a small shift of the camera can be told from a rotation:
 /// the movement that is taken out is the one that answers best at the distance of the boards, since
 /// their poses have answered there. Near them the projection is known best.
-/// @param board_distance  @param distance of the points, may be infinite; both in one unit, > 0
+/// @param board_distance of the boards from the camera, > 0
+/// @param distance of the points, in the same unit, > 0; may be infinite
 ProjectionField projectionUncertaintyAt(const LensModel& lens, const Eigen::MatrixXd& covariance,
                                         cv::Size image_size, double board_distance, double distance,
                                         int cols = 40);
