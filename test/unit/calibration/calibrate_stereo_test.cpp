@@ -85,6 +85,19 @@ TEST(CalibrateStereo, FindsThePoseBetweenTheCameras) {
   EXPECT_TRUE(result.left.file.covariance && result.right.file.covariance);
 }
 
+TEST(CalibrateStereo, PredictsPairsThatItHasNotSeen) {
+  const StereoScene scene(0.1);
+  CalibrationOptions options = scene.options();
+  EXPECT_FALSE(calibrateStereo(scene.seen_left, scene.seen_right, options).holdout_rms_px);
+  options.folds = 4;
+  const StereoCalibrationResult result =
+      calibrateStereo(scene.seen_left, scene.seen_right, options);
+  ASSERT_TRUE(result.holdout_rms_px);
+  // Noise of 0.1 px either way, a little of which a pose of its own takes up.
+  EXPECT_GT(*result.holdout_rms_px, 0.12);
+  EXPECT_LT(*result.holdout_rms_px, 0.16);
+}
+
 TEST(CalibrateStereo, NamesThePairThatDisagrees) {
   StereoScene scene(0.1);
   // The right camera's image of pair 3 is of another instant: the board had moved by then.

@@ -152,6 +152,21 @@ TEST(Calibrate, NoiseIsCarriedIntoTheCovariance) {
   EXPECT_LT(std::sqrt(squares / seeds), 0.07);
 }
 
+TEST(Calibrate, EverySetOfTwentyBoardsConvergesWhateverTheStructure) {
+  const LensPtr truth = wideLens();
+  const int seeds = fullTests() ? 20 : 4;
+  double squares = 0.0;
+  for (int seed = 1; seed <= seeds; ++seed) {
+    const BoardScene scene = wideScene(static_cast<unsigned>(seed), 0.1);
+    const CalibrationResult result = calibrate(test::simulatedBoards(*truth, scene), {});
+    const ProjectionField error = projectionDifference(*truth, *result.file.lens, scene.image_size);
+    EXPECT_LT(error.max_px, 0.2) << "seed " << seed;
+    squares += error.rms_px * error.rms_px;
+  }
+  // As good as the corners allow: the covariance predicts 0.05 px.
+  EXPECT_LT(std::sqrt(squares / seeds), 0.06);
+}
+
 TEST(Calibrate, OutliersHardlyMatter) {
   const LensPtr truth = wideLens();
   BoardScene scene = wideScene(7, 0.1);
