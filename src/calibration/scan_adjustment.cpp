@@ -5,6 +5,7 @@
 #include <ceres/evaluation_callback.h>
 
 #include <Eigen/Dense>
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <memory>
@@ -19,6 +20,9 @@ namespace {
 using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
 
 constexpr double kNowherePx = 1e3;
+/// Corners of boards are less exact than features measured through the lens: their loss never
+/// becomes as narrow.
+constexpr double kCornerLossPx = 0.5;
 /// Off-axis angle at which the slope on the axis is taken [rad].
 constexpr double kAxisAngle = 0.02;
 
@@ -272,7 +276,8 @@ std::optional<double> adjust(const ScanData& data, const AdjustOptions& options,
       for (std::size_t i = 0; i < view.pixels.size(); ++i) {
         problem.AddResidualBlock(
             new CornerCost(view.pixels[i], view.points[i], static_cast<int>(v), blocks),
-            new ceres::CauchyLoss(options.loss_px), lens, blocks.board_blocks[v].data());
+            new ceres::CauchyLoss(std::max(options.loss_px, kCornerLossPx)), lens,
+            blocks.board_blocks[v].data());
       }
       ordering->AddElementToGroup(blocks.board_blocks[v].data(), 1);
     }
