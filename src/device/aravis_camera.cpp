@@ -90,8 +90,9 @@ std::string list(const std::vector<AravisDevice>& devices) {
   return text;
 }
 
+/// Vendors have several spellings.
 bool same(const CameraIdentity& a, const CameraIdentity& b) {
-  return a.serial == b.serial && a.model == b.model && a.vendor == b.vendor;
+  return a.serial == b.serial && a.model == b.model;
 }
 
 std::optional<in_addr> parseAddress(const std::string& text) {
@@ -1071,6 +1072,14 @@ std::unique_ptr<Camera> openAravisCamera(const std::string& which, const CameraS
           (all.empty() ? "; none is found" : "; there are: " + list(all)));
     }
     device = found.front();
+    if (!device->address.empty()) {
+      // Aravis remembers cameras that are gone, and another may stand there now.
+      const std::optional<AravisDevice> there = probe(device->address);
+      if (!there || !same(there->identity, device->identity)) {
+        throw CameraError(describe(*device) + " does not answer" +
+                          (there ? "; there stands " + describe(*there) : ""));
+      }
+    }
     if (which.empty()) {
       remarks.push_back("the device names no camera, taking " + describe(*device) + " of " +
                         std::to_string(found.size()) +

@@ -21,11 +21,11 @@ std::unique_ptr<Camera> openCamera(const std::string& device, const CameraSettin
   }
   if (const auto which = rest("aravis")) return openAravisCamera(*which, settings);
   if (const auto which = rest("v4l2")) return openV4l2Camera(*which, settings);
-  throw InputError(
-      "device", "",
-      "is \"" + printable(device) +
-          "\", expected aravis:SERIAL (GigE or USB3 Vision), v4l2:/dev/… or replay:DIR (recorded "
-          "images)");
+  throw InputError("device", "",
+                   "is \"" + printable(device) +
+                       "\", expected aravis:SERIAL (GigE or USB3 Vision), v4l2:/dev/videoN or "
+                       "replay:DIR (recorded "
+                       "images)");
 }
 
 }  // namespace omnister::device
