@@ -225,14 +225,17 @@ StereoPipeline::~StereoPipeline() {
   }
   wake_.notify_all();
   thread_.join();
+  {
+    std::lock_guard<std::mutex> lock(connection_mutex_);
+    closing_ = true;
+    unsubscribe();
+  }
+  for (ros::Subscriber& subscriber : lens_subscribers_) subscriber.shutdown();
+  for (ros::Subscriber& subscriber : click_subscribers_) subscriber.shutdown();
   points_publisher_.shutdown();
   depth_publisher_.shutdown();
   range_publisher_.shutdown();
   epipolar_publisher_.shutdown();
-  for (ros::Subscriber& subscriber : lens_subscribers_) subscriber.shutdown();
-  for (ros::Subscriber& subscriber : click_subscribers_) subscriber.shutdown();
-  std::lock_guard<std::mutex> lock(connection_mutex_);
-  unsubscribe();
 }
 
 void StereoPipeline::configure(StereoConfig& config) {
@@ -325,6 +328,7 @@ void StereoPipeline::publishLens(const std::string& frame_id) {
 
 void StereoPipeline::onConnection() {
   std::lock_guard<std::mutex> lock(connection_mutex_);
+  if (closing_) return;
   const bool wanted = points_publisher_.getNumSubscribers() + depth_publisher_.getNumSubscribers() +
                           range_publisher_.getNumSubscribers() +
                           epipolar_publisher_.getNumSubscribers() >

@@ -98,12 +98,16 @@ ViewServer::ViewServer(const ros::NodeHandle& node, const ros::NodeHandle& priva
 
 ViewServer::~ViewServer() {
   config_server_.reset();
+  {
+    const std::lock_guard<std::mutex> lock(connection_mutex_);
+    closing_ = true;
+    // These wait for callbacks under way, which publish.
+    image_subscriber_.shutdown();
+    range_subscriber_.shutdown();
+  }
+  lens_subscriber_.shutdown();
   image_publisher_.shutdown();
   depth_publisher_.shutdown();
-  const std::lock_guard<std::mutex> lock(connection_mutex_);
-  lens_subscriber_.shutdown();
-  image_subscriber_.shutdown();
-  range_subscriber_.shutdown();
 }
 
 void ViewServer::configure(ViewConfig& config) {
@@ -119,6 +123,7 @@ void ViewServer::configure(ViewConfig& config) {
 
 void ViewServer::onConnection() {
   const std::lock_guard<std::mutex> lock(connection_mutex_);
+  if (closing_) return;
   try {
     const bool images = image_publisher_.getNumSubscribers() > 0;
     if (images && !image_subscriber_) {

@@ -125,6 +125,7 @@ class StereoPipeline {
   std::unique_ptr<message_filters::Synchronizer<SyncPolicy>> synchronizer_;
   std::vector<ros::Subscriber> lens_subscribers_;
   bool subscribed_ = false;
+  bool closing_ = false;  ///< nobody touches publishers any more
 
   mutable std::mutex mutex_;  ///< all below
   std::condition_variable wake_;

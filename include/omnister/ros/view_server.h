@@ -71,6 +71,7 @@ class ViewServer {
   image_transport::ImageTransport transport_;
 
   std::mutex connection_mutex_;  ///< subscribers and publishers
+  bool closing_ = false;         ///< nobody touches publishers any more; of connection_mutex_
   image_transport::CameraPublisher image_publisher_;
   image_transport::CameraPublisher depth_publisher_;
   image_transport::Subscriber image_subscriber_;
