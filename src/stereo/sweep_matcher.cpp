@@ -8,9 +8,7 @@
 #include <chrono>
 #include <cmath>
 #include <limits>
-#include <numeric>
 #include <opencv2/core.hpp>
-#include <tuple>
 #include <utility>
 
 #include "multi_position.h"
@@ -21,6 +19,7 @@
 #include "sweep_filters.h"
 #include "sweep_geometry.h"
 #include "sweep_kernels.h"
+#include "sweep_level.h"
 #include "sweep_pair.h"
 
 namespace omnister {
@@ -29,22 +28,11 @@ namespace {
 using namespace sweep;
 
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
-constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 constexpr float kFullCost = kWindow * kWindow * kBits;  ///< every bit of every descriptor wrong
 constexpr int kTileWidth = 64, kTileHeight = 48;
-constexpr float kMiddleX = 32, kMiddleY = 24;   ///< where planes are fitted about
-constexpr int kNarrowLanes = 14;                ///< hypotheses of the cheapest chunk
-constexpr int kSearchMargin = 3;                ///< columns beyond what the coarser level found
-constexpr int kMostPlanes = 3;                  ///< of a tile
-constexpr int kSampleStep = 3;                  ///< pixels of the coarser level between samples
-constexpr int kNeeded = 3, kNeededShare = 150;  ///< samples that make the search go somewhere
-constexpr float kOnPlane = 3.4f;                ///< columns off a plane that still belong to it,
-constexpr float kFarOff = 16;                   ///< or are looked for from it
-constexpr int kBeyond = 8;                      ///< pixels around where a plane was seen
-constexpr float kSteepest = 1.2f;               ///< columns a pixel that a plane may rise
-constexpr float kClaimUnits = 4;                ///< of a column, in which claims are compared;
-constexpr int kClaimTolerance = 7;              ///< so many of these two may differ by
-constexpr float kClaimScale = 0.5f;             ///< spots a column of the claims image
+constexpr float kClaimUnits = 4;     ///< of a column, in which claims are compared;
+constexpr int kClaimTolerance = 7;   ///< so many of these two may differ by
+constexpr float kClaimScale = 0.5f;  ///< spots a column of the claims image
 constexpr std::int32_t kUnclaimed = std::numeric_limits<std::int32_t>::max();
 constexpr float kEdgeJump = 1.5f;         ///< columns between surfaces at an edge
 constexpr int kSpeckle = 100;             ///< regions of fewer pixels go,
@@ -65,53 +53,6 @@ class Stopwatch {
  private:
   std::map<std::string, double>* seconds_;
   std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
-};
-
-/// One resolution of the pair.
-struct Level {
-  ReferenceMap map;
-  Layout layout;
-  Grid grid;
-  PaddedImage reference, displaced;
-  std::vector<std::uint8_t> cells[kPlanes];
-  int slack = 0;  ///< cells before the first and behind the last, for stray reads
-  cv::Mat h;      ///< CV_32FC1, hypotheses found
-};
-
-/// A surface that the next coarser level saw in a tile: a plane of hypotheses, and how far from it
-/// to look. All in columns; the plane by pixels from the tile's corner.
-struct Guess {
-  float at = 0, x = 0, y = 0;
-  std::vector<std::pair<int, int>> intervals;
-  cv::Rect where;  ///< part of the tile that it was seen in
-
-  float operator()(float u, float v) const { return at + x * u + y * v; }
-};
-
-/// A pixel of the coarser level: where it is in the tile, and its hypothesis in columns.
-struct Sample {
-  float x, y, columns;
-};
-
-/// What a thread keeps between tiles.
-struct Scratch {
-  std::vector<std::int32_t> base;
-  std::vector<float> residual, residual_sums, residual_mean;
-  MapView view;
-  std::vector<std::int16_t> wide;
-  std::vector<std::uint8_t> reference[kPlanes], costs, grey;
-  std::vector<std::uint16_t> cost, before, after;
-  std::vector<std::int16_t> index;
-  std::vector<int> histogram;
-  std::vector<Sample> samples, others;
-  std::vector<std::uint8_t> owner;
-  std::vector<Guess> guesses;
-  // Of the passes before, and one row of this one.
-  std::vector<std::uint16_t> best_cost, row_steep;
-  std::vector<float> row_h;
-  std::vector<std::int32_t> row_claim;
-  std::vector<std::int32_t> claims;     ///< of this thread's tiles
-  std::vector<float> rows[3], nothing;  ///< between two filters
 };
 
 /// Whether all of an image is of one grey level, give or take one.
@@ -192,7 +133,9 @@ class SweepMatcher : public SweepPair {
     makePyramid(reference, &Level::reference);
     makePyramid(displaced.front(), &Level::displaced);
     watch.lap("prefilter");
-    for (Level& level : levels_) describe(&level);
+    for (Level& level : levels_)
+      describeDisplaced(&level, options_.threads,
+                        [this]() -> Scratch& { return scratch_->local(); });
     watch.lap("describe");
     for (std::size_t l = levels_.size(); l-- > 0;) {
       matchLevel(l);
@@ -280,232 +223,6 @@ class SweepMatcher : public SweepPair {
     }
   }
 
-  /// Descriptors of the displaced image along its epipolar curves.
-  void describe(Level* level) {
-    constexpr int kStrip = 24;
-    const Grid& grid = level->grid;
-    for (const Band& band : grid.bands) {
-      parallelFor(0, (band.rows + kStrip - 1) / kStrip, options_.threads, [&](std::size_t strip) {
-        Scratch& scratch = scratch_->local();
-        const int begin = static_cast<int>(strip) * kStrip;
-        const int end = std::min(begin + kStrip, band.rows);
-        const int first = std::max(begin - 2, 0), last = std::min(end + 2, band.rows);
-        // Grey rows of the strip, on common columns.
-        int lo = std::numeric_limits<int>::max(), hi = std::numeric_limits<int>::min();
-        for (int r = first; r < last; ++r) {
-          if (band.runs[r] == 0) continue;
-          lo = std::min(lo, band.begin[r]);
-          hi = std::max(hi, band.begin[r] + band.runs[r] * 8);
-        }
-        if (lo > hi) return;
-        const int line = hi - lo + 16;
-        scratch.grey.assign(static_cast<std::size_t>(line) * (last - first + 4), 0);
-        const auto greyRow = [&](int r) {
-          return &scratch.grey[static_cast<std::size_t>(line) * (r - first + 2) + 8];
-        };
-        for (int r = first; r < last; ++r) {
-          if (band.runs[r] == 0) continue;
-          sampleRow(level->displaced, &grid.x[band.node[r]], &grid.y[band.node[r]],
-                    &grid.mask[(band.origin[r] + band.begin[r]) / 8], band.runs[r],
-                    greyRow(r) + band.begin[r] - lo);
-        }
-        for (int r = begin; r < end; ++r) {
-          if (band.runs[r] == 0) continue;
-          const std::uint8_t* rows[5];
-          for (int k = 0; k < 5; ++k) rows[k] = greyRow(r + k - 2) + band.begin[r] - lo;
-          std::uint8_t* out[kPlanes];
-          for (int p = 0; p < kPlanes; ++p)
-            out[p] = &level->cells[p][level->slack + band.origin[r] + band.begin[r]];
-          censusRow(rows, band.runs[r] * 8, out);
-        }
-      });
-    }
-  }
-
-  /// Surfaces that the coarser level saw in and around a tile, each with its intervals.
-  void guessTile(std::size_t l, const Tile& tile, const Band& band, Scratch* scratch) const {
-    std::vector<Guess>& guesses = scratch->guesses;
-    const float to_columns = static_cast<float>(1 / band.step_h);
-    const int least = static_cast<int>(std::floor(tile.h_min * to_columns)) - 1;
-    const int most = static_cast<int>(std::ceil(tile.h_max * to_columns)) + 1;
-    const cv::Rect whole(0, 0, tile.rect.width, tile.rect.height);
-    guesses.assign(1, {0, 0, 0, {{least, most}}, whole});
-    if (l + 1 == levels_.size()) return;
-    const cv::Mat& coarse = levels_[l + 1].h;
-    constexpr int kAround = 6;
-    const int x0 = std::max(tile.rect.x / 2 - kAround, 0);
-    const int y0 = std::max(tile.rect.y / 2 - kAround, 0);
-    const int x1 = std::min(tile.rect.br().x / 2 + kAround, coarse.cols);
-    const int y1 = std::min(tile.rect.br().y / 2 + kAround, coarse.rows);
-    std::vector<Sample>& samples = scratch->samples;
-    samples.clear();
-    int seen = 0;
-    for (int y = y0; y < y1; y += kSampleStep) {
-      const float* line = coarse.ptr<float>(y);
-      for (int x = x0 + y % 2; x < x1; x += kSampleStep) {
-        ++seen;
-        const float columns = line[x] * to_columns;
-        if (columns >= least - 2 && columns <= most + 2)  // neither NaN nor beyond
-          samples.push_back({2 * x + 0.5f - tile.rect.x, 2 * y + 0.5f - tile.rect.y, columns});
-      }
-    }
-    if (static_cast<int>(samples.size()) * 8 < seen) return;
-    // A few stray pixels do not widen the search; a thin object does.
-    const int needed = std::max(kNeeded, static_cast<int>(samples.size()) / kNeededShare);
-    guesses.clear();
-    if (most - least > kNarrowLanes) findPlanes(needed, scratch);
-
-    // Every sample goes to the plane nearest to it, or to none; these are looked for one and all
-    // where they are.
-    const std::size_t planes = guesses.size();
-    std::vector<std::uint8_t>& owner = scratch->owner;
-    owner.resize(samples.size());
-    std::size_t strays = 0;
-    for (std::size_t i = 0; i < samples.size(); ++i) {
-      float nearest = kFarOff;
-      owner[i] = static_cast<std::uint8_t>(planes);
-      for (std::size_t p = 0; p < planes; ++p) {
-        const float off = std::fabs(samples[i].columns - guesses[p](samples[i].x, samples[i].y));
-        if (off > nearest) continue;
-        nearest = off;
-        owner[i] = static_cast<std::uint8_t>(p);
-      }
-      strays += owner[i] == planes;
-    }
-    if (strays > 0) guesses.push_back({});
-    const float right = static_cast<float>(tile.rect.width - 1);
-    const float bottom = static_cast<float>(tile.rect.height - 1);
-    bool covered = false;
-    for (std::size_t p = 0; p < guesses.size(); ++p) {
-      Guess& guess = guesses[p];
-      const auto [low, high] =
-          std::minmax({guess(0, 0), guess(right, 0), guess(0, bottom), guess(right, bottom)});
-      const int from = least - static_cast<int>(std::ceil(high));
-      const int to = most - static_cast<int>(std::floor(low));
-      std::vector<int>& histogram = scratch->histogram;
-      histogram.assign(to - from + 3, 0);
-      const auto bin = [&](const Sample& s) {
-        const float off = s.columns - guess(s.x, s.y);
-        return 1 + std::clamp(static_cast<int>(std::lround(off)), from, to) - from;
-      };
-      for (std::size_t i = 0; i < samples.size(); ++i) {
-        if (owner[i] == p) ++histogram[bin(samples[i])];
-      }
-      for (int k = from; k <= to; ++k) {
-        const int* count = &histogram[1 + k - from];
-        if (count[0] == 0 || count[-1] + count[0] + count[1] < needed) continue;
-        const int first = std::max(k - kSearchMargin, from);
-        const int last = std::min(k + kSearchMargin, to);
-        if (!guess.intervals.empty() && first <= guess.intervals.back().second + 4)
-          guess.intervals.back().second = last;
-        else
-          guess.intervals.emplace_back(first, last);
-      }
-      // The first is looked for all over, so that every pixel is told something.
-      guess.where = whole;
-      if (guess.intervals.empty() || !std::exchange(covered, true)) continue;
-      float x_min = right, x_max = 0, y_min = bottom, y_max = 0;
-      for (std::size_t i = 0; i < samples.size(); ++i) {
-        const int* count = &histogram[owner[i] == p ? bin(samples[i]) : 1];
-        if (owner[i] != p || count[-1] + count[0] + count[1] < needed) continue;
-        x_min = std::min(x_min, samples[i].x);
-        x_max = std::max(x_max, samples[i].x);
-        y_min = std::min(y_min, samples[i].y);
-        y_max = std::max(y_max, samples[i].y);
-      }
-      const cv::Point corner(static_cast<int>(x_min) - kBeyond, static_cast<int>(y_min) - kBeyond);
-      const cv::Point end(static_cast<int>(x_max) + kBeyond, static_cast<int>(y_max) + kBeyond);
-      guess.where &= cv::Rect(corner, end);
-    }
-    guesses.erase(std::remove_if(guesses.begin(), guesses.end(),
-                                 [](const Guess& guess) {
-                                   return guess.intervals.empty() || guess.where.empty();
-                                 }),
-                  guesses.end());
-    if (guesses.empty()) guesses.push_back({0, 0, 0, {{least, most}}, whole});
-  }
-
-  /// The planes that most samples lie on, one after the other.
-  static void findPlanes(int needed, Scratch* scratch) {
-    std::vector<Sample>& left = scratch->others;
-    left = scratch->samples;
-    for (int plane = 0; plane < kMostPlanes; ++plane) {
-      Guess guess;
-      const auto isOff = [&](const Sample& s) {
-        return std::fabs(s.columns - guess(s.x, s.y)) > kOnPlane;
-      };
-      const bool smooth = plane == 0 && fitPlane(left, 1, &guess) &&
-                          std::count_if(left.begin(), left.end(), isOff) * 6 <=
-                              static_cast<std::ptrdiff_t>(left.size());
-      if (!smooth && (!samplePlane(left, needed, &guess) || !fitPlane(left, 3, &guess))) return;
-      const auto end =
-          std::remove_if(left.begin(), left.end(), [&](const Sample& s) { return !isOff(s); });
-      if (left.end() - end < 3 * needed) return;
-      left.erase(end, left.end());
-      scratch->guesses.push_back(guess);
-      if (static_cast<int>(left.size()) < 3 * needed) return;
-    }
-  }
-
-  /// The plane through three neighbouring samples that most others lie on.
-  static bool samplePlane(const std::vector<Sample>& samples, int needed, Guess* guess) {
-    constexpr int kTrials = 12;
-    const std::size_t n = samples.size();
-    const std::size_t stride = std::max<std::size_t>(1, n / 96);
-    std::uint32_t random = 12345;
-    int best = 3 * needed / static_cast<int>(stride);
-    bool found = false;
-    for (int trial = 0; trial < kTrials; ++trial) {
-      random = random * 1664525u + 1013904223u;
-      const std::size_t i = (random >> 8) % n;
-      const Sample &a = samples[i], &b = samples[(i + 3 + trial % 4) % n];
-      const Sample& c = samples[(i + 42 + trial) % n];
-      const float bx = b.x - a.x, by = b.y - a.y, cx = c.x - a.x, cy = c.y - a.y;
-      const float area = bx * cy - by * cx;
-      if (std::fabs(area) < 40) continue;
-      const float bz = b.columns - a.columns, cz = c.columns - a.columns;
-      Guess trial_plane;
-      trial_plane.x = (bz * cy - cz * by) / area;
-      trial_plane.y = (cz * bx - bz * cx) / area;
-      if (std::hypot(trial_plane.x, trial_plane.y) > kSteepest) continue;
-      trial_plane.at = a.columns - trial_plane.x * a.x - trial_plane.y * a.y;
-      int on = 0;
-      for (std::size_t k = 0; k < n; k += stride) {
-        on += std::fabs(samples[k].columns - trial_plane(samples[k].x, samples[k].y)) < 1.5f;
-      }
-      if (on <= best) continue;
-      best = on;
-      *guess = trial_plane;
-      found = true;
-    }
-    return found;
-  }
-
-  /// Least squares, reweighted. @param rounds 1: from scratch; 3: only refined
-  static bool fitPlane(const std::vector<Sample>& samples, int start, Guess* guess) {
-    const std::size_t stride = std::max<std::size_t>(1, samples.size() / 96);
-    Eigen::Vector3f plane((*guess).x, (*guess).y, (*guess)(kMiddleX, kMiddleY));
-    for (int iteration = start - 1; iteration < 4; ++iteration) {
-      Eigen::Matrix3f A = Eigen::Matrix3f::Zero();
-      Eigen::Vector3f b = Eigen::Vector3f::Zero();
-      for (std::size_t i = 0; i < samples.size(); i += stride) {
-        const Eigen::Vector3f row(samples[i].x - kMiddleX, samples[i].y - kMiddleY, 1);
-        const float error = samples[i].columns - plane.dot(row);
-        const float scale = iteration == 1 ? 6.0f : 2.0f;
-        const float weight = iteration == 0 ? 1.0f : 1 / (1 + error * error / (scale * scale));
-        A += weight * row * row.transpose();
-        b += weight * samples[i].columns * row;
-      }
-      A.diagonal().array() += 1e-3f;
-      plane = A.inverse() * b;
-      if (!plane.allFinite()) return false;
-    }
-    guess->x = plane.x();
-    guess->y = plane.y();
-    guess->at = plane.z() - kMiddleX * plane.x() - kMiddleY * plane.y();
-    return std::hypot(guess->x, guess->y) <= kSteepest;
-  }
-
   void matchLevel(std::size_t l) {
     Level& level = levels_[l];
     parallelFor(0, level.layout.tiles.size(), options_.threads,
@@ -534,7 +251,7 @@ class SweepMatcher : public SweepPair {
     map_job.origin = band.origin.data();
     map_job.cells = level.grid.cells;
     map_job.to_column = static_cast<float>(level.grid.column_scale / band.step_h);
-    guessTile(l, tile, band, scratch);
+    guessTile(l + 1 < levels_.size() ? &levels_[l + 1].h : nullptr, tile, band, scratch);
     const MapView& view = scratch->view;
     viewMap(level.map,
             rect + cv::Size(2 * kViewHalo, 2 * kViewHalo) - cv::Point(kViewHalo, kViewHalo),
@@ -548,7 +265,7 @@ class SweepMatcher : public SweepPair {
       mapRow(map_job, &view.phi[at], &view.a[at], count, &scratch->base[y * stride + from],
              &scratch->residual[y * stride + from]);
     };
-    describeTile(l, tile, band, stride, scratch);
+    describeTile(level, l == 0, tile, band, stride, scratch);
 
     const std::size_t inner = rect.area() + 64;
     scratch->cost.resize(inner);
@@ -617,60 +334,6 @@ class SweepMatcher : public SweepPair {
       }
     }
     return 2 * alike > all;
-  }
-
-  /// Census of the tile's pixels and halo in the local epipolar frames.
-  void describeTile(std::size_t l, const Tile& tile, const Band& band, int stride,
-                    Scratch* scratch) const {
-    const Level& level = levels_[l];
-    const MapView& view = scratch->view;
-    const cv::Rect& rect = tile.rect;
-    const int width = rect.width + 2 * kRadius, height = rect.height + 2 * kRadius;
-    for (auto& plane : scratch->reference)
-      plane.assign(static_cast<std::size_t>(stride) * height + 64, 0);
-    // Everything that windows of this tile can touch.
-    constexpr int kAround = PaddedImage::kPad - kRadius;
-    const int wide_stride = stride + 2 * kAround;
-    scratch->wide.resize(static_cast<std::size_t>(wide_stride) * (height + 2 * kAround) + 64);
-    widenBlock(level.reference, rect.x - kRadius - kAround, rect.y - kRadius - kAround,
-               width + 2 * kAround, height + 2 * kAround, scratch->wide.data(), wide_stride);
-    const bool narrow = l > 0;
-    const int block = narrow ? kBlock : 2 * kBlock;
-    for (int y = 0; y < height; y += kBlock) {
-      for (int x = 0; x < width; x += block) {
-        const int w = std::min(block, width - x), h = std::min(kBlock, height - y);
-        const int u0 = rect.x + x - kRadius, v0 = rect.y + y - kRadius;
-        Eigen::Vector2f d_phi, d_a;
-        bool found = false;
-        for (const auto& [du, dv] : {std::pair(w / 2, h / 2), std::pair(2, 2), std::pair(w - 3, 2),
-                                     std::pair(2, h - 3), std::pair(w - 3, h - 3)}) {
-          const int u = std::clamp(u0 + du, 0, level.map.size.width - 1);
-          const int v = std::clamp(v0 + dv, 0, level.map.size.height - 1);
-          if (view.phi[view.at(u, v)] == kNoRay) continue;
-          if (localFrame(view, u, v, &d_phi, &d_a)) {
-            found = true;
-            break;
-          }
-        }
-        if (!found) continue;
-        d_phi *= static_cast<float>(band.step_phi);
-        d_a *= static_cast<float>(band.step_h / level.grid.column_scale);
-        constexpr float kLongest = 2.8f;
-        if (d_phi.norm() > kLongest) d_phi *= kLongest / d_phi.norm();
-        if (d_a.norm() > kLongest) d_a *= kLongest / d_a.norm();
-        CensusOffsets offsets;
-        for (int i = 0; i < kBits; ++i) {
-          const int position = i < 12 ? i : i + 1;
-          const Eigen::Vector2f offset = d_phi * (position / 5 - 2) + d_a * (position % 5 - 2);
-          offsets.dx[i] = offset.x();
-          offsets.dy[i] = offset.y();
-        }
-        std::uint8_t* out[kPlanes];
-        for (int p = 0; p < kPlanes; ++p) out[p] = &scratch->reference[p][y * stride + x];
-        censusBlock(&scratch->wide[(y + kAround) * wide_stride + x + kAround], wide_stride, w, h,
-                    offsets, narrow, out, stride);
-      }
-    }
   }
 
   /// @param merge whether another pass was concluded before; the lower cost wins

@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: Apache-2.0
+/// @file What the parts of the sweep of one pair work on.
+#pragma once
+
+#include <functional>
+#include <opencv2/core.hpp>
+#include <utility>
+#include <vector>
+
+#include "sweep_geometry.h"
+#include "sweep_kernels.h"
+
+namespace omnister::sweep {
+
+/// One resolution of the pair.
+struct Level {
+  ReferenceMap map;
+  Layout layout;
+  Grid grid;
+  PaddedImage reference, displaced;
+  std::vector<std::uint8_t> cells[kPlanes];
+  int slack = 0;  ///< cells before the first and behind the last, for stray reads
+  cv::Mat h;      ///< CV_32FC1, hypotheses found
+};
+
+/// A surface that the next coarser level saw in a tile: a plane of hypotheses, and how far from it
+/// to look. All in columns; the plane by pixels from the tile's corner.
+struct Guess {
+  float at = 0, x = 0, y = 0;
+  std::vector<std::pair<int, int>> intervals;
+  cv::Rect where;  ///< part of the tile that it was seen in
+
+  float operator()(float u, float v) const { return at + x * u + y * v; }
+};
+
+/// A pixel of the coarser level: where it is in the tile, and its hypothesis in columns.
+struct Sample {
+  float x, y, columns;
+};
+
+/// What a thread keeps between tiles.
+struct Scratch {
+  std::vector<std::int32_t> base;
+  std::vector<float> residual, residual_sums, residual_mean;
+  MapView view;
+  std::vector<std::int16_t> wide;
+  std::vector<std::uint8_t> reference[kPlanes], costs, grey;
+  std::vector<std::uint16_t> cost, before, after;
+  std::vector<std::int16_t> index;
+  std::vector<int> histogram;
+  std::vector<Sample> samples, others;
+  std::vector<std::uint8_t> owner;
+  std::vector<Guess> guesses;
+  // Of the passes before, and one row of this one.
+  std::vector<std::uint16_t> best_cost, row_steep;
+  std::vector<float> row_h;
+  std::vector<std::int32_t> row_claim;
+  std::vector<std::int32_t> claims;     ///< of this thread's tiles
+  std::vector<float> rows[3], nothing;  ///< between two filters
+};
+
+/// Descriptors of the displaced image along its epipolar curves.
+/// @param scratch gives that of the calling thread
+void describeDisplaced(Level* level, int threads, const std::function<Scratch&()>& scratch);
+
+/// Census of the tile's pixels and halo in the local epipolar frames, to Scratch::reference.
+/// @param finest whether the level is the one of full resolution
+void describeTile(const Level& level, bool finest, const Tile& tile, const Band& band, int stride,
+                  Scratch* scratch);
+
+/// Surfaces that the coarser level saw in and around a tile, each with its intervals, to
+/// Scratch::guesses; at least one.
+/// @param coarse CV_32FC1, its hypotheses; null for the coarsest level: all hypotheses
+void guessTile(const cv::Mat* coarse, const Tile& tile, const Band& band, Scratch* scratch);
+
+}  // namespace omnister::sweep
