@@ -6,10 +6,10 @@
 #include <set>
 
 #include "grbl_protocol.h"
-#include "serial_port.h"
-#include "serial_stages.h"
 #include "omnister/common/numbers.h"
 #include "omnister/device/camera.h"
+#include "serial_port.h"
+#include "serial_stages.h"
 
 namespace omnister::device {
 namespace {
@@ -41,16 +41,14 @@ constexpr char kHome[] = "$H";
 constexpr char kReset = 0x18;
 constexpr char kJogCancel = static_cast<char>(0x85);
 
-class GrblStage : public Stage {
+class GrblStage : public SerialStage {
  public:
   GrblStage(const std::string& port, const StageSettings& settings);
-  StageIdentity identity() const override { return identity_; }
   StageReading read() override;
-  void moveTo(double position_m, double speed_mps) override;
-  void stop() override;
   void home() override;
   void recover() override;
-  std::vector<std::string> takeRemarks() override { return std::exchange(remarks_, {}); }
+  void moveTo(double position_m, double speed_mps) override;
+  void stop() override;
 
  private:
   struct Answer {
@@ -87,7 +85,6 @@ class GrblStage : public Stage {
   const double unit_m_;
   const std::size_t axis_;
   SerialPort port_;
-  StageIdentity identity_;
   std::map<int, double> options_;  ///< `$N=value`
   double scale_ = 1.0;             ///< of reports, to mm ($13: inches)
 
@@ -114,7 +111,6 @@ class GrblStage : public Stage {
   std::optional<double> target_;  ///< of the jog under way [mm]
   Steady::time_point jog_at_;
   std::string pending_;  ///< what to send once the jog under way has braked
-  std::vector<std::string> remarks_;
 };
 
 bool isMotion(const GrblStatus& status) {
@@ -173,7 +169,7 @@ void GrblStage::meet() {
 
 void GrblStage::readSettings() {
   if (!command("$$", kCommandTimeout).came) {
-    remarks_.push_back("GRBL did not list its settings ($$)");
+    remark("GRBL did not list its settings ($$)");
   }
   command("$I", kCommandTimeout);
   const auto option = options_.find(13);
@@ -222,7 +218,7 @@ void GrblStage::onAnswer(int error) {
     homed_ = error == 0;
     moved_ = true;
     next_poll_ = Steady::now();
-    if (error != 0) remarks_.push_back("homing was refused: " + grblErrorName(error));
+    if (error != 0) remark("homing was refused: " + grblErrorName(error));
   }
 }
 
@@ -334,7 +330,7 @@ void GrblStage::poll() {
     }
     // A reset whose banner was garbled, a hand on the carriage: whatever it was, it is elsewhere.
     if (fit == Fit::kContradiction || (homed_ && report_->state == "Alarm")) {
-      if (homed_) remarks_.push_back("the position jumped: the stage has lost its reference");
+      if (homed_) remark("the position jumped: the stage has lost its reference");
       loseReference();
     }
     take(*report_, *position, stamp);
@@ -365,7 +361,7 @@ StageReading GrblStage::read() {
         jog(line);
       }
     } catch (const StageError& e) {
-      remarks_.push_back(e.what());
+      remark(e.what());
     }
   }
   StageReading reading;

@@ -93,17 +93,15 @@ std::optional<std::int64_t> parseInteger(const std::string& text) {
   return static_cast<std::int64_t>(*value);
 }
 
-class ZaberStage : public Stage {
+class ZaberStage : public SerialStage {
  public:
   ZaberStage(const std::string& port, const StageSettings& settings);
   ~ZaberStage() override;
-  StageIdentity identity() const override { return identity_; }
   StageReading read() override;
   void moveTo(double position_m, double speed_mps) override;
   void stop() override;
   void home() override;
   void recover() override;
-  std::vector<std::string> takeRemarks() override { return std::exchange(remarks_, {}); }
 
  private:
   /// Sends a command until a valid reply comes. Only for commands that may be sent twice.
@@ -124,12 +122,10 @@ class ZaberStage : public Stage {
   /// Sends a move with the speed in it, or with the speed as a setting where a device knows no
   /// other.
   void sendMove(const std::string& command, std::int64_t speed, bool repeatable);
-  void remarkOnce(const std::string& text);
   void setReferenced(bool referenced);
 
   const StageSettings settings_;
   SerialPort port_;
-  StageIdentity identity_;
   int id_ = 0;
   bool replies_protected_ = false;
   bool restore_checksum_ = false;
@@ -151,8 +147,6 @@ class ZaberStage : public Stage {
 
   std::optional<Stamp> last_stamp_;
   std::int64_t last_position_ = 0;
-  std::vector<std::string> remarks_;
-  std::set<std::string> remarked_;
 };
 
 ZaberStage::ZaberStage(const std::string& port, const StageSettings& settings)
@@ -209,10 +203,6 @@ void ZaberStage::meet() {
   if (!replies_protected_) {
     remarkOnce("the stage sends no checksums: each position is read twice instead");
   }
-}
-
-void ZaberStage::remarkOnce(const std::string& text) {
-  if (remarked_.insert(text).second) remarks_.push_back(text);
 }
 
 std::optional<ZaberReply> ZaberStage::requestOnce(const std::string& command, bool whole_device,

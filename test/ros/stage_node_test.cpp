@@ -1,14 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // The stage node as a process of its own, with simulated Zaber and GRBL controllers on its serial
 // port.
-#include <actionlib/client/simple_action_client.h>
 #include <gmock/gmock.h>
-#include <omnister/MoveStageAction.h>
-#include <omnister/StageState.h>
 #include <sensor_msgs/JointState.h>
 #include <signal.h>
 #include <std_msgs/Float64.h>
-#include <std_srvs/Trigger.h>
 #include <sys/wait.h>
 #include <tf2_ros/transform_broadcaster.h>
 #include <unistd.h>
@@ -17,18 +13,16 @@
 
 #include "omnister/ros/conversions.h"
 #include "omnister/sim/serial_devices.h"
-#include "ros/ros_test.h"
+#include "ros/stage_client.h"
 #include "temporary_folder.h"
 
 namespace omnister {
 namespace {
 
-using actionlib::SimpleClientGoalState;
 using test::Collector;
 using test::eventually;
+using test::SimpleClientGoalState;
 using testing::HasSubstr;
-
-using Client = actionlib::SimpleActionClient<MoveStageAction>;
 
 /// A stage_node in a namespace of its own.
 class NodeProcess {
@@ -64,9 +58,9 @@ class NodeProcess {
   pid_t pid_;
 };
 
-class StageNode : public testing::Test {
+class StageNode : public test::StageClientTest {
  protected:
-  StageNode() : node_("/stage_node_" + std::to_string(++count_)) {
+  StageNode() : StageClientTest("/stage_node_" + std::to_string(++count_)) {
     mechanics_.max_speed_mps = 1.0;
     mechanics_.acceleration_mps2 = 4.0;
     mechanics_.homing_speed_mps = 0.3;
@@ -76,10 +70,7 @@ class StageNode : public testing::Test {
   void start(std::vector<std::string> parameters) {
     parameters.insert(parameters.end(), {"speed_mps:=0.5", "retry_period:=0.2"});
     process_ = std::make_unique<NodeProcess>(node_.getNamespace().substr(1), parameters);
-    states_ = std::make_unique<Collector<StageState>>(node_, "stage_state");
-    client_ = std::make_unique<Client>(node_, "move_stage", false);
-    ASSERT_TRUE(client_->waitForServer(ros::Duration(30.0)));
-    ASSERT_TRUE(eventually([&] { return states_->size() > 0; }, 30.0));
+    connect();
   }
 
   void startWith(const std::string& kind) {
@@ -99,26 +90,9 @@ class StageNode : public testing::Test {
     ASSERT_TRUE(eventually([&] { return states_->last()->fault.empty(); }, 30.0));
   }
 
-  SimpleClientGoalState move(double position, bool relative = false) {
-    MoveStageGoal goal;
-    goal.position = position;
-    goal.relative = relative;
-    client_->sendGoal(goal);
-    EXPECT_TRUE(client_->waitForResult(ros::Duration(60.0)));
-    return client_->getState();
-  }
   void begin(double position, double speed) {
-    MoveStageGoal goal;
-    goal.position = position;
-    goal.speed = speed;
-    client_->sendGoal(goal);
-    ASSERT_TRUE(eventually([&] { return truth_->read().moving; }, 30.0));
-    ASSERT_TRUE(eventually([&] { return states_->last()->moving; }, 30.0));
-  }
-  std_srvs::TriggerResponse call(const std::string& service) {
-    std_srvs::Trigger call;
-    EXPECT_TRUE(ros::service::call(node_.resolveName(service), call));
-    return call.response;
+    client_->sendGoal(goal(position, false, speed));
+    ASSERT_TRUE(eventually([&] { return truth_->read().moving && moving(); }, 30.0));
   }
   void home() {
     ASSERT_TRUE(call("home").success);
@@ -214,14 +188,11 @@ class StageNode : public testing::Test {
   }
 
   static int count_;
-  ros::NodeHandle node_;
   test::TemporaryFolder folder_;
   sim::SimulatedStageOptions mechanics_;
   std::shared_ptr<sim::SimulatedStage> truth_;
   std::unique_ptr<sim::SerialStageDevice> device_;
   std::unique_ptr<NodeProcess> process_;
-  std::unique_ptr<Collector<StageState>> states_;
-  std::unique_ptr<Client> client_;
 };
 int StageNode::count_ = 0;
 

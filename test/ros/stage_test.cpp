@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <actionlib/client/simple_action_client.h>
 #include <gmock/gmock.h>
 #include <sensor_msgs/JointState.h>
 #include <tf2_msgs/TFMessage.h>
@@ -10,16 +9,15 @@
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/stage_driver.h"
 #include "omnister/sim/simulated_stage.h"
-#include "ros/ros_test.h"
+#include "ros/stage_client.h"
 
 namespace omnister {
 namespace {
 
-using actionlib::SimpleClientGoalState;
 using test::Collector;
 using test::eventually;
+using test::SimpleClientGoalState;
 using testing::HasSubstr;
-using Client = actionlib::SimpleActionClient<MoveStageAction>;
 
 /// The driver opens links to a stage that goes on existing; a link can be cut.
 class Link : public device::Stage {
@@ -46,10 +44,11 @@ class Link : public device::Stage {
   std::shared_ptr<std::atomic<bool>> cut_;
 };
 
-class StageTest : public testing::Test {
+class StageTest : public test::StageClientTest {
  protected:
   StageTest()
-      : node_("stage_" + std::to_string(++count_)), private_("~" + node_.getNamespace().substr(1)) {
+      : StageClientTest("stage_" + std::to_string(++count_)),
+        private_("~" + node_.getNamespace().substr(1)) {
     parameters_.retry_period_s = 0.05;
     parameters_.speed_mps = 0.5;
     options_.max_speed_mps = 1.0;
@@ -63,43 +62,16 @@ class StageTest : public testing::Test {
     stage_ = std::make_shared<sim::SimulatedStage>(options_);
     driver_ = std::make_unique<StageDriver>(
         node_, private_, parameters_, [this] { return std::make_unique<Link>(stage_, cut_); });
-    states_ = std::make_unique<Collector<StageState>>(node_, "stage_state");
-    client_ = std::make_unique<Client>(node_, "move_stage", false);
-    ASSERT_TRUE(client_->waitForServer(ros::Duration(20.0)));
-    ASSERT_TRUE(eventually([&] { return states_->size() > 0; }));
+    connect();
   }
-
-  static MoveStageGoal goal(double position, bool relative = false, double speed = 0.0) {
-    MoveStageGoal goal;
-    goal.position = position;
-    goal.relative = relative;
-    goal.speed = speed;
-    return goal;
-  }
-
-  SimpleClientGoalState move(const MoveStageGoal& goal) {
-    client_->sendGoal(goal);
-    EXPECT_TRUE(client_->waitForResult(ros::Duration(20.0)));
-    return client_->getState();
-  }
-
-  std_srvs::TriggerResponse call(const std::string& service) {
-    std_srvs::Trigger call;
-    EXPECT_TRUE(ros::service::call(node_.resolveName(service), call));
-    return call.response;
-  }
-
-  bool moving() const { return states_->last()->moving; }
 
   static int count_;
-  ros::NodeHandle node_, private_;
+  ros::NodeHandle private_;
   StageParameters parameters_;
   sim::SimulatedStageOptions options_;
   std::shared_ptr<std::atomic<bool>> cut_ = std::make_shared<std::atomic<bool>>(false);
   std::shared_ptr<sim::SimulatedStage> stage_;
   std::unique_ptr<StageDriver> driver_;
-  std::unique_ptr<Collector<StageState>> states_;
-  std::unique_ptr<Client> client_;
 };
 int StageTest::count_ = 0;
 
