@@ -4,6 +4,7 @@
 
 #include <cairo.h>
 
+#include <algorithm>
 #include <memory>
 #include <opencv2/core/mat.hpp>
 #include <string>
@@ -31,6 +32,21 @@ std::string asImage(const cv::Mat& image, int width_px);
 
 /// A figure with its caption (HTML).
 std::string figure(const std::string& image, const std::string& caption);
+
+/// What an axis has to hold.
+struct Range {
+  double low = 1e300, high = -1e300;
+  void add(double value) {
+    low = std::min(low, value);
+    high = std::max(high, value);
+  }
+  /// @param share of the length added at either end
+  void widen(double share = 0.05) {
+    const double room = std::max(1e-9, high - low) * share;
+    low -= room;
+    high += room;
+  }
+};
 
 /// A drawing of one plot: data coordinates inside a frame with a few numbers along its axes.
 class Plot {
