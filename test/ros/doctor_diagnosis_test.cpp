@@ -58,9 +58,29 @@ DoctorFacts healthyRig() {
   return facts;
 }
 
+using Seed = std::function<void(DoctorFacts&)>;
+
+/// The camera's driver sends nothing, and says why.
+Seed silentDriver(const std::string& state, const std::string& problem) {
+  return [=](DoctorFacts& facts) {
+    facts.images[0].received = 0;
+    facts.images[0].driver_state = state;
+    facts.images[0].driver_problem = problem;
+  };
+}
+
+/// All frames come to this end at the stereo node. @param more what else is wrong
+Seed framesEnd(const std::string& where, const Seed& more = {}) {
+  return [=](DoctorFacts& facts) {
+    facts.stereo.counts = {{"received", 20}, {where, 20}};
+    if (where == "no baseline") facts.stereo.counts["settled"] = 20;
+    if (more) more(facts);
+  };
+}
+
 struct Fault {
   const char* code;
-  std::function<void(DoctorFacts&)> seed;
+  Seed seed;
   const char* mend;  ///< part of what is to be done
 };
 
@@ -81,27 +101,9 @@ const std::vector<Fault>& stageFaults() {
        "ROS_IP"},
       {"two_publishers", [](DoctorFacts& f) { f.images[0].publishers.push_back("/other"); },
        "namespace"},
-      {"camera_permission",
-       [](DoctorFacts& f) {
-         f.images[0].received = 0;
-         f.images[0].driver_state = "opening";
-         f.images[0].driver_problem = "/dev/video0: Permission denied";
-       },
-       "video"},
-      {"camera_busy",
-       [](DoctorFacts& f) {
-         f.images[0].received = 0;
-         f.images[0].driver_state = "opening";
-         f.images[0].driver_problem = "another program controls it";
-       },
-       "close it"},
-      {"camera_absent",
-       [](DoctorFacts& f) {
-         f.images[0].received = 0;
-         f.images[0].driver_state = "lost";
-         f.images[0].driver_problem = "no frame for 3 s";
-       },
-       "cable"},
+      {"camera_permission", silentDriver("opening", "/dev/video0: Permission denied"), "video"},
+      {"camera_busy", silentDriver("opening", "another program controls it"), "close it"},
+      {"camera_absent", silentDriver("lost", "no frame for 3 s"), "cable"},
       {"camera_waits_for_trigger",
        [](DoctorFacts& f) {
          f.images[0].received = 0;
@@ -145,40 +147,17 @@ const std::vector<Fault>& stageFaults() {
        "mount"},
       {"tf_not_connected", [](DoctorFacts& f) { f.tf.connected = false; }, "parent_frame_id"},
       {"tf_old", [](DoctorFacts& f) { f.tf.age = 60.0; }, "chrony"},
-      {"no_pose_in_time",
-       [](DoctorFacts& f) {
-         f.stereo.counts = {{"received", 20}, {"no pose", 20}};
-       },
-       "max_wait"},
+      {"no_pose_in_time", framesEnd("no pose"), "max_wait"},
       {"travel_too_short", [](DoctorFacts& f) { f.stage.limits_apart = 0.005; }, "min_baseline"},
-      {"never_settles",
-       [](DoctorFacts& f) {
-         f.stereo.counts = {{"received", 20}, {"moving", 20}};
-       },
-       "settle_time 0"},
+      {"never_settles", framesEnd("moving"), "settle_time 0"},
       {"baseline_too_short",
-       [](DoctorFacts& f) {
-         f.stereo.counts = {{"received", 20}, {"settled", 20}, {"no baseline", 20}};
-         f.stereo.missed_baseline = 0.004;
-       },
+       framesEnd("no baseline", [](DoctorFacts& f) { f.stereo.missed_baseline = 0.004; }),
        "further"},
       {"baseline_too_long",
-       [](DoctorFacts& f) {
-         f.stereo.counts = {{"received", 20}, {"settled", 20}, {"no baseline", 20}};
-         f.stereo.missed_baseline = 1.5;
-       },
-       "shorter"},
-      {"stage_not_homed",
-       [](DoctorFacts& f) {
-         f.stereo.counts = {{"received", 20}, {"settled", 20}, {"no baseline", 20}};
-         f.stage.homed = false;
-       },
+       framesEnd("no baseline", [](DoctorFacts& f) { f.stereo.missed_baseline = 1.5; }), "shorter"},
+      {"stage_not_homed", framesEnd("no baseline", [](DoctorFacts& f) { f.stage.homed = false; }),
        "home"},
-      {"stage_not_moving",
-       [](DoctorFacts& f) {
-         f.stereo.counts = {{"received", 20}, {"settled", 20}, {"no baseline", 20}};
-       },
-       "move_stage"},
+      {"stage_not_moving", framesEnd("no baseline"), "move_stage"},
       {"bad_lens", [](DoctorFacts& f) { f.stereo.counts["bad lens"] = 1; }, "import"},
       {"matching_failed", [](DoctorFacts& f) { f.stereo.counts["failed"] = 3; }, "docs/nodes.md"},
       {"no_memory", [](DoctorFacts& f) { f.free_memory_mb = 90.0; }, "stop"},
