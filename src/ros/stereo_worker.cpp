@@ -66,8 +66,11 @@ PreparedSet StereoWorker::prepare(const StereoSet& set, const LensFile& referenc
   PreparedSet prepared;
   prepared.geometry.reference_lens = reference.lens;
   prepared.geometry.reference_size = reference.image_size;
-  for (const Pose& pose : set.T_ref_disp)
+  if (reference.covariance) prepared.geometry.reference_covariance = *reference.covariance;
+  for (const Pose& pose : set.T_ref_disp) {
     prepared.geometry.displaced.push_back({displaced.lens, displaced.image_size, pose});
+    if (displaced.covariance) prepared.geometry.displaced.back().covariance = *displaced.covariance;
+  }
   // 16-bit images of a set are scaled alike.
   prepared.bits = significantBits(*set.reference);
   for (const auto& image : set.displaced)

@@ -10,6 +10,7 @@
 #include "multi_position.h"
 #include "omnister/common/error.h"
 #include "omnister/stereo/matching_limits.h"
+#include "range_uncertainty.h"
 #include "sweep_kernels.h"
 #include "sweep_pair.h"
 
@@ -62,7 +63,8 @@ StreamMatcher::StreamMatcher(const MatcherOptions& options, int frames_kept)
 
 StreamMatcher::~StreamMatcher() = default;
 
-void StreamMatcher::setReference(const LensPtr& lens, const cv::Mat& image) {
+void StreamMatcher::setReference(const LensPtr& lens, const cv::Mat& image,
+                                 const Eigen::MatrixXd& covariance) {
   if (!lens) throw Error("the reference camera has no lens");
   if (image.empty() || image.type() != CV_8UC1)
     throw Error("reference image is not one of 8 bits and one channel");
@@ -74,6 +76,7 @@ void StreamMatcher::setReference(const LensPtr& lens, const cv::Mat& image) {
   }
   state.geometry.reference_lens = lens;
   state.geometry.reference_size = image.size();
+  state.geometry.reference_covariance = covariance;
   state.reference = image.clone();
   state.kept.clear();
   if (state.fusion) state.fusion->clear();
@@ -116,6 +119,10 @@ MatchResult StreamMatcher::add(const StereoGeometry::Displaced& camera, const cv
   result.statistics.rejected["not confirmed"] =
       state.refinement->refine(state.reference, images, state.fusion->support, &inverse, &weight);
   concludeRange(inverse, weight, state.fusion->score, state.options, &result);
+  if (hasCovariance(geometry)) {
+    const double min_range = checkMatching(geometry, state.options).min_range;
+    RangeUncertainty(geometry, min_range, state.options.threads).addTo(&result);
+  }
   const auto end = std::chrono::steady_clock::now();
   result.statistics.seconds["refine"] = std::chrono::duration<double>(end - fused).count();
   result.statistics.seconds["total"] = std::chrono::duration<double>(end - start).count();

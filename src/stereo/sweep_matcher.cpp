@@ -15,6 +15,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
 #include "omnister/stereo/matching_limits.h"
+#include "range_uncertainty.h"
 #include "sweep_fill.h"
 #include "sweep_filters.h"
 #include "sweep_geometry.h"
@@ -666,9 +667,12 @@ std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
   for (const auto& displaced : geometry.displaced)
     bytes += 20 * std::max(pixels, static_cast<double>(displaced.size.area()));
   checkMemory(bytes, "the sweep");
+  std::unique_ptr<Matcher> matcher;
   if (geometry.displaced.size() > 1 || options.refine || !options.prior.empty())
-    return makeMultiPositionMatcher(geometry, options);
-  return std::make_unique<SweepMatcher>(geometry, options);
+    matcher = makeMultiPositionMatcher(geometry, options);
+  else
+    matcher = std::make_unique<SweepMatcher>(geometry, options);
+  return withCalibrationSigma(std::move(matcher), geometry, options);
 }
 
 std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,

@@ -16,6 +16,7 @@
 #include "omnister/stereo/epipolar.h"
 #include "omnister/stereo/matching_limits.h"
 #include "omnister/stereo/triangulation.h"
+#include "range_uncertainty.h"
 
 namespace omnister {
 namespace {
@@ -371,7 +372,8 @@ ThesisMask parseThesisMask(std::string_view name) {
 std::unique_ptr<Matcher> makeThesisMatcher(const StereoGeometry& geometry,
                                            const MatcherOptions& options,
                                            const ThesisOptions& thesis) {
-  return std::make_unique<ThesisMatcher>(geometry, options, thesis);
+  return withCalibrationSigma(std::make_unique<ThesisMatcher>(geometry, options, thesis), geometry,
+                              options);
 }
 
 }  // namespace omnister

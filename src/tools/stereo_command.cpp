@@ -47,6 +47,7 @@ struct StereoArguments {
   std::string mask;
   std::string prior;
   std::string roi;
+  std::vector<std::string> pose_sigmas;
   int reduce = 1;
   std::string matcher = "sweep";
   std::string thesis_mask = "fig5.5";
@@ -185,6 +186,23 @@ cv::Mat readPrior(const std::string& path, cv::Size size) {
   return prior;
 }
 
+// "metres radians": standard deviations of each coordinate of the place and of each rotation.
+Eigen::MatrixXd parsePoseSigma(const std::string& text) {
+  std::istringstream stream(text);
+  std::string place, rotation, rest;
+  stream >> place >> rotation;
+  const auto metres = parseNumber(place), radians = parseNumber(rotation);
+  if (!metres || !radians || !(*metres >= 0.0 && *metres <= 1e3) ||
+      !(*radians >= 0.0 && *radians <= 3.2) || (stream >> rest)) {
+    throw Error("--pose-sigma is '" + printable(text) +
+                "', expected two numbers, of the place [m] and of the rotation [rad]");
+  }
+  Eigen::VectorXd variances(6);
+  variances << Eigen::Vector3d::Constant(*metres * *metres),
+      Eigen::Vector3d::Constant(*radians * *radians);
+  return variances.asDiagonal();
+}
+
 struct Inputs {
   StereoGeometry geometry;
   cv::Mat reference;               // CV_8UC1
@@ -196,8 +214,12 @@ struct Inputs {
 void reduceInputs(StereoArguments& arguments, Inputs* inputs) {
   const int factor = arguments.reduce;
   StereoGeometry& geometry = inputs->geometry;
+  // What is one lens stays one.
+  std::map<LensPtr, LensPtr> lenses;
   const auto shrink = [&](LensPtr& lens, cv::Size& size, const char* whose) {
-    lens = reducedLens(lens, factor);
+    LensPtr& small = lenses[lens];
+    if (!small) small = reducedLens(lens, factor);
+    lens = small;
     size = size / factor;
     if (size.width < 16 || size.height < 16) {
       throw Error(std::string("reduced ") + std::to_string(factor) + " times the " + whose +
@@ -226,12 +248,19 @@ Inputs readInputs(StereoArguments& arguments) {
                 std::to_string(arguments.lens_displaced.size()) +
                 " lenses: give --lens-displaced once for all, or one for each --displaced");
   }
+  if (arguments.pose_sigmas.size() > 1 && arguments.pose_sigmas.size() != count) {
+    throw Error(std::to_string(count) + " displaced image(s) but " +
+                std::to_string(arguments.pose_sigmas.size()) +
+                " --pose-sigma: give it once for all, or once for each --displaced");
+  }
   Inputs inputs;
   const LensFile lens = readLensFile(arguments.lens);
   inputs.geometry.reference_lens = lens.lens;
   inputs.geometry.reference_size = lens.image_size;
+  if (lens.covariance) inputs.geometry.reference_covariance = *lens.covariance;
   std::vector<std::string> lens_paths(count, arguments.lens);
-  std::map<std::string, LensFile> lenses;
+  // One file is one lens, so that what it is wrong by is known to move both images alike.
+  std::map<std::string, LensFile> lenses = {{arguments.lens, lens}};
   for (std::size_t i = 0; i < count; ++i) {
     if (!arguments.lens_displaced.empty()) {
       lens_paths[i] = arguments.lens_displaced[arguments.lens_displaced.size() > 1 ? i : 0];
@@ -244,6 +273,11 @@ Inputs readInputs(StereoArguments& arguments) {
     displaced.lens = known->second.lens;
     displaced.size = known->second.image_size;
     displaced.T_ref_disp = parsePose(arguments.poses[i], "--pose");
+    if (known->second.covariance) displaced.covariance = *known->second.covariance;
+    if (!arguments.pose_sigmas.empty()) {
+      displaced.pose_covariance =
+          parsePoseSigma(arguments.pose_sigmas[arguments.pose_sigmas.size() > 1 ? i : 0]);
+    }
     inputs.geometry.displaced.push_back(displaced);
   }
   inputs.color = readMatchingImage(arguments.reference, arguments.lens, lens.image_size);
@@ -420,6 +454,11 @@ void addStereo(CLI::App& app) {
              "T_ref_disp, one for each --displaced: \"tx ty tz qx qy qz qw\" [m], which maps "
              "coordinates of the displaced camera into the reference camera")
       ->type_name("POSE");
+  repeatable("--pose-sigma", arguments->pose_sigmas,
+             "How well a pose is known, \"metres radians\": standard deviations of each coordinate "
+             "of the place and of each rotation, which make part of sigma as the lens files' "
+             "covariances do; once for all, or one for each --displaced; default: exact")
+      ->type_name("SIGMAS");
   command
       ->add_option("--min-range", arguments->options.min_range,
                    "Least range along the ray [m]; 0: four baselines")

@@ -25,8 +25,15 @@ struct StereoGeometry {
     LensPtr lens;
     cv::Size size;                  ///< [px]
     Pose T_ref_disp = Pose::Identity();
+    /// Of lens->parameters(); empty: exact. A lens that is the reference's own has its covariance.
+    Eigen::MatrixXd covariance = {};
+    /// 6x6 of a shift [m] and a small rotation [rad] of the displaced camera, both in the reference
+    /// frame; empty: exact.
+    Eigen::MatrixXd pose_covariance = {};
   };
   std::vector<Displaced> displaced; ///< at least one
+  /// Of reference_lens->parameters(); empty: exact. Covariances make part of the sigma of ranges.
+  Eigen::MatrixXd reference_covariance = {};
 };
 
 struct MatcherOptions {
@@ -54,7 +61,7 @@ struct MatchStatistics {
 /// Images on the reference pixel grid, all CV_32FC1; NaN where invalid.
 struct MatchResult {
   cv::Mat range;    ///< along the ray from the reference camera's centre [m]
-  cv::Mat sigma;    ///< standard deviation of range [m]
+  cv::Mat sigma;    ///< standard deviation of range, by matching and by calibration [m]
   cv::Mat score;    ///< 0 (worthless) to 1 (perfect)
   MatchStatistics statistics;
 };

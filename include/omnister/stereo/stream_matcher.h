@@ -27,8 +27,10 @@ class StreamMatcher {
   StreamMatcher& operator=(const StreamMatcher&) = delete;
 
   /// Forgets all frames. @param image CV_8UC1
+  /// @param covariance of lens->parameters(); empty: exact
   /// @throws Error for an image of another type, or without a lens
-  void setReference(const LensPtr& lens, const cv::Mat& image);
+  void setReference(const LensPtr& lens, const cv::Mat& image,
+                    const Eigen::MatrixXd& covariance = {});
 
   /// A frame joins the estimate.
   /// @return range, sigma and score of all frames so far

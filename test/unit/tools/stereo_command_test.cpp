@@ -243,6 +243,31 @@ TEST_F(StereoCommand, RegionReductionAndPrior) {
     EXPECT_THAT(refusal(arguments(sweep, {"--reduce", reduce})), HasSubstr("reduce"));
 }
 
+TEST_F(StereoCommand, CalibrationsMakePartOfSigma) {
+  const auto sigma = [&](const std::string& lens, const std::vector<std::string>& added) {
+    const Outcome outcome = run(arguments({{"--matcher", ""}, {"--lens", path(lens)}}, added));
+    EXPECT_EQ(outcome.code, 0) << outcome.err;
+    const cv::Mat all = readCloud(path("cloud.ply")).sigma;
+    const float value = all.at<float>(all.rows / 2, all.cols / 2);
+    EXPECT_TRUE(std::isfinite(value));
+    return value;
+  };
+  LensFile lens = readLensFile(path("lens.yaml"));
+  const Eigen::Index count = lens.lens->parameters().size();
+  lens.covariance = 4.0 * Eigen::MatrixXd::Identity(count, count);
+  writeLensFile(path("unsure.yaml"), lens);
+  const float exact = sigma("lens.yaml", {});
+  EXPECT_GT(sigma("unsure.yaml", {}), exact);
+  EXPECT_GT(sigma("unsure.yaml", {"--reduce", "2"}), sigma("lens.yaml", {"--reduce", "2"}));
+  // A step of 0.3 m that is known to 10 % makes ranges uncertain by 10 %.
+  const float unsure = sigma("lens.yaml", {"--pose-sigma", "0.03 0"});
+  EXPECT_NEAR(std::sqrt(unsure * unsure - exact * exact), 0.2, 0.04);
+  for (const char* bad : {"1", "a b", "-1 0", "0 1 2", "nan 0", "0 9"})
+    EXPECT_THAT(refusal(arguments({}, {"--pose-sigma", bad})), HasSubstr("--pose-sigma"));
+  EXPECT_THAT(refusal(arguments({}, {"--pose-sigma", "0 0", "--pose-sigma", "0 0"})),
+              HasSubstr("2 --pose-sigma"));
+}
+
 TEST_F(StereoCommand, SaysWhyImagesGiveNothing) {
   const auto err = [&](const cv::Mat& displaced, const char* matcher) {
     cv::imwrite(path("other.png"), displaced);
