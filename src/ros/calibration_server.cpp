@@ -84,7 +84,7 @@ CalibrationParameters loadCalibrationParameters(Parameters& parameters) {
 CalibrationServer::CalibrationServer(const ros::NodeHandle& node,
                                      const ros::NodeHandle& private_node)
     : parameters_(load(private_node)),
-      node_(node),
+      node_(callbacks_.on(node)),
       transport_(node_),
       diagnostics_(node, private_node, private_node.getNamespace()) {
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
@@ -102,10 +102,11 @@ CalibrationServer::CalibrationServer(const ros::NodeHandle& node,
   server_ = std::make_unique<Server>(
       node_, "calibrate", [this](const CalibrateGoalConstPtr& goal) { execute(goal); }, false);
   server_->start();
-  ros::NodeHandle own = private_node;
+  ros::NodeHandle own = callbacks_.on(private_node);
   services_ = {own.advertiseService("start", &CalibrationServer::onStart, this),
                own.advertiseService("save", &CalibrationServer::onSave, this),
                own.advertiseService("reset", &CalibrationServer::onReset, this)};
+  callbacks_.start();
   if (parameters_.start) begin();
 }
 
@@ -169,8 +170,6 @@ bool CalibrationServer::onReset(std_srvs::Trigger::Request& /*request*/,
 }
 
 CalibrationServer::~CalibrationServer() {
-  diagnostics_timer_.stop();
-  for (ros::ServiceServer& service : services_) service.shutdown();
   {
     std::lock_guard<std::mutex> lock(mutex_);
     stopping_ = true;
@@ -179,8 +178,8 @@ CalibrationServer::~CalibrationServer() {
   progress_.notify_all();
   // Joins the thread of execute(), which sees stopping_ and still needs the server.
   server_->shutdown();
-  image_subscriber_.shutdown();
   worker_.join();
+  callbacks_.stop();
 }
 
 void CalibrationServer::execute(const CalibrateGoalConstPtr& goal) {

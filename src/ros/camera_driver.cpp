@@ -154,13 +154,13 @@ std::unique_ptr<device::Camera> openDevice(const CameraParameters& parameters) {
 
 CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
                            CameraParameters parameters, OpenCamera open)
-    : node_(node),
+    : node_(callbacks_.on(node)),
       parameters_(std::move(parameters)),
       open_(std::move(open)),
       last_report_(Steady::now()),
       settings_(parameters_.settings),
       last_frame_(Steady::now()),
-      private_node_(private_node),
+      private_node_(callbacks_.on(private_node)),
       diagnostics_(node, private_node, private_node.getNamespace()) {
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
   if (!parameters_.lens.empty()) setLens(readLensFile(parameters_.lens));
@@ -181,6 +181,7 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
   timer_ = node_.createWallTimer(ros::WallDuration(0.1),
                                  [this](const ros::WallTimerEvent&) { onTimer(); });
   thread_ = std::thread(&CameraDriver::run, this);
+  callbacks_.start();
 }
 
 CameraDriver::~CameraDriver() {
@@ -195,8 +196,7 @@ CameraDriver::~CameraDriver() {
     const std::lock_guard<std::mutex> lock(mutex_);
     tasks_.clear();
   }
-  // Its callback uses the other members.
-  timer_.stop();
+  callbacks_.stop();
 }
 
 void CameraDriver::waitFor(double seconds) {
@@ -489,7 +489,9 @@ void CameraDriver::onTimer() {
     if (opened) diagnostics_.setHardwareID(identity_.serial);
   }
   if (opened && !config_server_) {
-    // Not before there is a device: what is not known is not written to the parameters.
+    // Not before there is a device: what is not known is not written to the parameters. Who asks
+    // for something from now on waits until it can be done.
+    const boost::recursive_mutex::scoped_lock lock(config_mutex_);
     config_server_ =
         std::make_unique<dynamic_reconfigure::Server<CameraConfig>>(config_mutex_, private_node_);
     config_ = CameraConfig::__getDefault__();

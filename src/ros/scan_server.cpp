@@ -75,7 +75,7 @@ std::vector<double> stopsOf(const ScanGoal& goal) {
 }
 
 ScanServer::ScanServer(const ros::NodeHandle& node, const ScanParameters& parameters)
-    : parameters_(parameters), node_(node), transport_(node_) {
+    : parameters_(parameters), node_(callbacks_.on(node)), transport_(node_) {
   frame_publisher_ = node_.advertise<StageFrame>("stage_frames", 100);
   image_publisher_ = transport_.advertise("scan/image_raw", 10);
   state_subscriber_ = node_.subscribe("stage_state", 200, &ScanServer::onState, this);
@@ -83,6 +83,7 @@ ScanServer::ScanServer(const ros::NodeHandle& node, const ScanParameters& parame
   server_ = std::make_unique<Server>(
       node_, "scan", [this](const ScanGoalConstPtr& goal) { execute(goal); }, false);
   server_->start();
+  callbacks_.start();
 }
 
 ScanServer::~ScanServer() {
@@ -93,7 +94,7 @@ ScanServer::~ScanServer() {
   wake_.notify_all();
   // Joins the thread of execute(), which sees stopping_ and still needs the server.
   server_->shutdown();
-  image_subscriber_.shutdown();
+  callbacks_.stop();
 }
 
 void ScanServer::onImage(const sensor_msgs::ImageConstPtr& image) {

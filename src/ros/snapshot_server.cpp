@@ -17,7 +17,7 @@
 namespace omnister {
 
 SnapshotServer::SnapshotServer(const ros::NodeHandle& node, const ros::NodeHandle& private_node)
-    : node_(node) {
+    : node_(callbacks_.on(node)) {
   Parameters parameters(private_node);
   cloud_path_ = parameters.text("cloud", "cloud.ply");
   range_path_ = parameters.text("range", "range.tiff");
@@ -25,8 +25,9 @@ SnapshotServer::SnapshotServer(const ros::NodeHandle& node, const ros::NodeHandl
   parameters.warnUnknown();
   checkCloudPath(cloud_path_);
   checkRangePath(range_path_);
-  ros::NodeHandle service_node = private_node;
+  ros::NodeHandle service_node = callbacks_.on(private_node);
   service_ = service_node.advertiseService("save", &SnapshotServer::onSave, this);
+  callbacks_.start();
 }
 
 bool SnapshotServer::onSave(std_srvs::Trigger::Request&, std_srvs::Trigger::Response& response) {

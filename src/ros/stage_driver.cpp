@@ -82,7 +82,7 @@ OpenStage stageOpener(const ros::NodeHandle& node, const StageParameters& p) {
 
 StageDriver::StageDriver(const ros::NodeHandle& node, const ros::NodeHandle& private_node,
                          StageParameters parameters, OpenStage open)
-    : node_(node),
+    : node_(callbacks_.on(node)),
       parameters_(std::move(parameters)),
       open_(std::move(open)),
       state_publisher_(node_.advertise<StageState>("stage_state", 50)),
@@ -101,11 +101,13 @@ StageDriver::StageDriver(const ros::NodeHandle& node, const ros::NodeHandle& pri
   diagnostics_.add("stage", this, &StageDriver::diagnose);
   thread_ = std::thread(&StageDriver::run, this);
   server_.start();
+  callbacks_.start();
 }
 
 StageDriver::~StageDriver() {
   stop_ = true;
   thread_.join();
+  callbacks_.stop();
   const std::lock_guard<std::mutex> lock(mutex_);
   try {
     if (stage_ && stage_->read().moving) stage_->stop();

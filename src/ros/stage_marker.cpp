@@ -49,7 +49,7 @@ StageMarker::StageMarker(const ros::NodeHandle& node, const ros::NodeHandle& pri
     : parameters_(load(private_node)),
       node_(node),
       mover_(node_, "move_stage", true),
-      server_(node_.resolveName("stage_marker")) {
+      server_(node_.resolveName("stage_marker"), "", true) {
   for (const char* service : {"home", "halt", "recover"}) {
     std::string title(service);
     title[0] = static_cast<char>(std::toupper(title[0]));

@@ -9,8 +9,7 @@ int main(int argc, char** argv) {
   const ros::NodeHandle keep;
   try {
     const omnister::StageMarker marker{ros::NodeHandle(), ros::NodeHandle("~")};
-    // One thread may wait for a service while others go on.
-    ros::MultiThreadedSpinner(2).spin();
+    ros::spin();
   } catch (const std::exception& error) {
     ROS_FATAL("%s", error.what());
     return 1;

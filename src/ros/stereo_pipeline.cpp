@@ -154,7 +154,7 @@ StereoParameters load(const ros::NodeHandle& private_node) {
 
 StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandle& private_node)
     : parameters_(load(private_node)),
-      node_(node),
+      node_(callbacks_.on(node)),
       transport_(node_),
       eyes_(parameters_.rig ? 2 : 1),
       live_(parameters_),
@@ -181,8 +181,8 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
   }
   tf_listener_ = std::make_unique<tf2_ros::TransformListener>(tf_buffer_);
   // Reads the same parameters, which are known to be good by now.
-  config_server_ =
-      std::make_unique<dynamic_reconfigure::Server<StereoConfig>>(config_mutex_, private_node);
+  config_server_ = std::make_unique<dynamic_reconfigure::Server<StereoConfig>>(
+      config_mutex_, callbacks_.on(private_node));
   config_server_->updateConfig(toConfig(parameters_));
   config_server_->setCallback([this](StereoConfig& config, std::uint32_t) { configure(config); });
   lens_publisher_ = node_.advertise<visualization_msgs::MarkerArray>("lens_surface", 1, true);
@@ -214,28 +214,17 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       ros::WallDuration(1.0),
       [this](const ros::SteadyTimerEvent&) { diagnostics_.force_update(); });
   thread_ = std::thread([this] { run(); });
+  callbacks_.start();
 }
 
 StereoPipeline::~StereoPipeline() {
-  config_server_.reset();
-  diagnostics_timer_.stop();
+  callbacks_.stop();
   {
     std::lock_guard<std::mutex> lock(mutex_);
     stopping_ = true;
   }
   wake_.notify_all();
   thread_.join();
-  {
-    std::lock_guard<std::mutex> lock(connection_mutex_);
-    closing_ = true;
-    unsubscribe();
-  }
-  for (ros::Subscriber& subscriber : lens_subscribers_) subscriber.shutdown();
-  for (ros::Subscriber& subscriber : click_subscribers_) subscriber.shutdown();
-  points_publisher_.shutdown();
-  depth_publisher_.shutdown();
-  range_publisher_.shutdown();
-  epipolar_publisher_.shutdown();
 }
 
 void StereoPipeline::configure(StereoConfig& config) {
@@ -328,7 +317,6 @@ void StereoPipeline::publishLens(const std::string& frame_id) {
 
 void StereoPipeline::onConnection() {
   std::lock_guard<std::mutex> lock(connection_mutex_);
-  if (closing_) return;
   const bool wanted = points_publisher_.getNumSubscribers() + depth_publisher_.getNumSubscribers() +
                           range_publisher_.getNumSubscribers() +
                           epipolar_publisher_.getNumSubscribers() >

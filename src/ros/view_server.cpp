@@ -74,13 +74,15 @@ ViewParameters loadViewParameters(Parameters& parameters) {
 }
 
 ViewServer::ViewServer(const ros::NodeHandle& node, const ros::NodeHandle& private_node)
-    : parameters_(load(private_node)), node_(node), transport_(node_), config_(parameters_.view) {
+    : parameters_(load(private_node)),
+      node_(callbacks_.on(node)),
+      transport_(node_),
+      config_(parameters_.view) {
   if (!parameters_.lens.empty()) lens_ = readLensFile(parameters_.lens);
-  config_server_ =
-      std::make_unique<dynamic_reconfigure::Server<ViewConfig>>(config_mutex_, private_node);
+  config_server_ = std::make_unique<dynamic_reconfigure::Server<ViewConfig>>(
+      config_mutex_, callbacks_.on(private_node));
   config_server_->setCallback([this](ViewConfig& config, std::uint32_t) { configure(config); });
 
-  const std::lock_guard<std::mutex> lock(connection_mutex_);
   const image_transport::SubscriberStatusCallback images_changed =
       [this](const image_transport::SingleSubscriberPublisher&) { onConnection(); };
   const ros::SubscriberStatusCallback infos_changed =
@@ -94,21 +96,10 @@ ViewServer::ViewServer(const ros::NodeHandle& node, const ros::NodeHandle& priva
         "lens_model", kLensesWaiting,
         [this](const LensModelMessage::ConstPtr& message) { onLens(message); });
   }
+  callbacks_.start();
 }
 
-ViewServer::~ViewServer() {
-  config_server_.reset();
-  {
-    const std::lock_guard<std::mutex> lock(connection_mutex_);
-    closing_ = true;
-    // These wait for callbacks under way, which publish.
-    image_subscriber_.shutdown();
-    range_subscriber_.shutdown();
-  }
-  lens_subscriber_.shutdown();
-  image_publisher_.shutdown();
-  depth_publisher_.shutdown();
-}
+ViewServer::~ViewServer() { callbacks_.stop(); }
 
 void ViewServer::configure(ViewConfig& config) {
   if (config.projection != "cylindrical" && config.projection != "equirectangular")
@@ -122,8 +113,6 @@ void ViewServer::configure(ViewConfig& config) {
 }
 
 void ViewServer::onConnection() {
-  const std::lock_guard<std::mutex> lock(connection_mutex_);
-  if (closing_) return;
   try {
     const bool images = image_publisher_.getNumSubscribers() > 0;
     if (images && !image_subscriber_) {

@@ -22,6 +22,7 @@
 #include "omnister/calibration/calibrate.h"
 #include "omnister/calibration/detector.h"
 #include "omnister/calibration/target.h"
+#include "omnister/ros/callback_threads.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/view_collector.h"
@@ -92,6 +93,7 @@ class CalibrationServer {
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
   const CalibrationParameters parameters_;
+  CallbackThreads callbacks_{2};  ///< before all that uses it; one may wait for a fit
   ros::NodeHandle node_;
   image_transport::ImageTransport transport_;
   image_transport::Subscriber image_subscriber_;

@@ -34,6 +34,7 @@
 #include "omnister/common/pose.h"
 #include "omnister/device/camera.h"
 #include "omnister/lens/lens_file.h"
+#include "omnister/ros/callback_threads.h"
 #include "omnister/ros/lens_store.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/static_frames.h"
@@ -123,6 +124,7 @@ class CameraDriver {
   std::string storeName() const;
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
+  CallbackThreads callbacks_;  // before all that uses it
   ros::NodeHandle node_;
   const CameraParameters parameters_;
   const OpenCamera open_;

@@ -27,6 +27,8 @@
 #include <string>
 #include <vector>
 
+#include "omnister/ros/callback_threads.h"
+
 namespace omnister {
 
 /// Private parameters of the same names.
@@ -92,6 +94,7 @@ class ScanServer {
   void writeRecording();
 
   const ScanParameters parameters_;
+  CallbackThreads callbacks_{2};  ///< before all that uses it
   ros::NodeHandle node_;
   image_transport::ImageTransport transport_;
   image_transport::Subscriber image_subscriber_;

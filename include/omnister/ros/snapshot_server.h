@@ -8,6 +8,8 @@
 #include <filesystem>
 #include <string>
 
+#include "omnister/ros/callback_threads.h"
+
 namespace omnister {
 
 /// Service `~save` (std_srvs/Trigger): waits for the next cloud on `points2` and the range image on
@@ -19,11 +21,15 @@ class SnapshotServer {
  public:
   /// @throws Error for parameters that do not hold
   SnapshotServer(const ros::NodeHandle& node, const ros::NodeHandle& private_node);
+  ~SnapshotServer() { callbacks_.stop(); }
+  SnapshotServer(const SnapshotServer&) = delete;
+  SnapshotServer& operator=(const SnapshotServer&) = delete;
 
  private:
   bool onSave(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   std::string save() const;
 
+  CallbackThreads callbacks_;  // before all that uses it
   ros::NodeHandle node_;
   std::filesystem::path cloud_path_;
   std::filesystem::path range_path_;

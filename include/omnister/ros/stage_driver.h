@@ -28,6 +28,7 @@
 #include <thread>
 
 #include "omnister/device/stage.h"
+#include "omnister/ros/callback_threads.h"
 #include "omnister/ros/external_stage.h"
 
 namespace omnister {
@@ -116,6 +117,7 @@ class StageDriver {
   device::Stage& stageLocked();
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
+  CallbackThreads callbacks_{2};  // before all that uses it; one may wait for the device
   ros::NodeHandle node_;
   const StageParameters parameters_;
   const OpenStage open_;

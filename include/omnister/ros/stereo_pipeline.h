@@ -25,6 +25,7 @@
 #include <vector>
 
 #include "omnister/lens/lens_file.h"
+#include "omnister/ros/callback_threads.h"
 #include "omnister/ros/frame_pairing.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
@@ -106,6 +107,7 @@ class StereoPipeline {
 
   const StereoParameters parameters_;  ///< as loaded; what may change is in live_
   std::optional<Pose> T_left_right_;
+  CallbackThreads callbacks_;  // before all that uses it
   ros::NodeHandle node_;
   image_transport::ImageTransport transport_;
   tf2_ros::Buffer tf_buffer_;
@@ -125,7 +127,6 @@ class StereoPipeline {
   std::unique_ptr<message_filters::Synchronizer<SyncPolicy>> synchronizer_;
   std::vector<ros::Subscriber> lens_subscribers_;
   bool subscribed_ = false;
-  bool closing_ = false;  ///< nobody touches publishers any more
 
   mutable std::mutex mutex_;  ///< all below
   std::condition_variable wake_;

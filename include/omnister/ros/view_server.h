@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "omnister/lens/lens_file.h"
+#include "omnister/ros/callback_threads.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/static_frames.h"
@@ -67,11 +68,10 @@ class ViewServer {
   void say(const std::exception& error) const;
 
   const ViewParameters parameters_;
+  CallbackThreads callbacks_;  // before all that uses it
   ros::NodeHandle node_;
   image_transport::ImageTransport transport_;
 
-  std::mutex connection_mutex_;  ///< subscribers and publishers
-  bool closing_ = false;         ///< nobody touches publishers any more; of connection_mutex_
   image_transport::CameraPublisher image_publisher_;
   image_transport::CameraPublisher depth_publisher_;
   image_transport::Subscriber image_subscriber_;
