@@ -1,9 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bundle.h"
 
-#include <ceres/ceres.h>
-#include <ceres/evaluation_callback.h>
-
 #include <Eigen/Cholesky>
 #include <Eigen/Geometry>
 #include <array>
@@ -67,11 +64,10 @@ void linearize(const LensModel& lens, const PoseValue& pose, const PoseValue* ri
   out.d_k2 = d_rotated.col(2) * corner.bulge[1];
 }
 
-/// Parameter blocks and, at each evaluation, the lenses and rotations made of them once for all
-/// corners.
-class Blocks : public ceres::EvaluationCallback {
+/// Parameter blocks, and the lenses and rotations made of them once for all corners.
+class Blocks {
  public:
-  explicit Blocks(const BundleState& state) : state_(state) {
+  explicit Blocks(const BundleState& state) : state_(&state) {
     for (const LensPtr& lens : state.lenses) lens_blocks.push_back(lens->parameters());
     for (const Pose& pose : state.poses) pose_blocks.push_back(blockOf(pose));
     warp = state.warp;
@@ -80,16 +76,13 @@ class Blocks : public ceres::EvaluationCallback {
     prepare();
   }
 
-  void PrepareForEvaluation(bool, bool new_point) override {
-    if (new_point) prepare();
-  }
-
   void prepare() {
     lenses.clear();
     for (std::size_t i = 0; i < lens_blocks.size(); ++i) {
       // A lens that does not change need not be built, nor can it fail.
-      const bool same = lens_blocks[i] == state_.lenses[i]->parameters();
-      lenses.push_back(same ? state_.lenses[i] : state_.lenses[i]->withParameters(lens_blocks[i]));
+      const bool same = lens_blocks[i] == state_->lenses[i]->parameters();
+      lenses.push_back(same ? state_->lenses[i]
+                            : state_->lenses[i]->withParameters(lens_blocks[i]));
     }
     poses.clear();
     for (const Vector6d& block : pose_blocks) poses.emplace_back(block.data());
@@ -97,10 +90,8 @@ class Blocks : public ceres::EvaluationCallback {
   }
 
   BundleState state() const {
-    BundleState state = state_;
-    for (std::size_t i = 0; i < lens_blocks.size(); ++i) {
-      state.lenses[i] = state_.lenses[i]->withParameters(lens_blocks[i]);
-    }
+    BundleState state = *state_;
+    state.lenses = lenses;
     for (std::size_t i = 0; i < pose_blocks.size(); ++i) state.poses[i] = poseOf(pose_blocks[i]);
     state.warp = warp;
     state.T_right_left = poseOf(rig);
@@ -119,19 +110,97 @@ class Blocks : public ceres::EvaluationCallback {
   std::optional<PoseValue> rig_value;
 
  private:
-  const BundleState& state_;
+  const BundleState* state_;
 };
 
 /// Weight of a grid's control points [px per rad], see adjust().
 constexpr double kGridWeight = 100.0;
 
-/// The normal equations of the whole problem: what is shared (lens parameters, warp, rig and axis,
-/// in that order, those that are free), and one pose each.
-class NormalEquations {
+/// The loss acts on each corner. Its second order, which plain weights leave out, is taken along
+/// (Triggs et al. 1999, sec. 4.3): J^T W J with W = rho' I + 2 rho'' r r^T, held positive, so that
+/// corners on the way to being outliers do not slow the fit down.
+struct Robust {
+  double cost;
+  Eigen::Matrix2d chain = Eigen::Matrix2d::Identity();  ///< W = chain^2
+  Eigen::Vector2d residual;                             ///< chain^-1 rho' r
+
+  Robust(const Eigen::Vector2d& r, double loss_px) : cost(r.squaredNorm()), residual(r) {
+    if (!(loss_px > 0.0)) return;
+    const double s = cost;
+    const double c2 = loss_px * loss_px;
+    const double weight = 1.0 / (1.0 + s / c2);  // rho'
+    const double root = std::sqrt(weight);
+    const double across = std::sqrt(std::max((1.0 - s / c2) * weight, 0.05));
+    cost = c2 * std::log1p(s / c2);
+    chain *= root;
+    if (s > 0.0) chain -= (root * (1.0 - across) / s) * r * r.transpose();
+    residual *= root / across;
+  }
+};
+
+/// Levenberg and Marquardt. `System` has two places: where it stands and a trial.
+///   double build();            cost and equations at the trial; infinite where there is none
+///   void accept();             the trial becomes where it stands
+///   double propose(damping);   a new trial; what it should lower the cost by, at least, or a
+///                              negative number when the equations have no solution
+/// @return false when the first trial has no cost
+template <typename System>
+bool minimise(System& system, int max_iterations, double tolerance) {
+  double cost = system.build();
+  if (!(cost < HUGE_VAL)) return false;
+  system.accept();
+  // Damping follows how well the last step was foretold (Nielsen 1999): it neither grows in a
+  // narrow valley nor has to be found anew at each step.
+  double damping = 1e-6;
+  double growth = 2.0;
+  for (int iteration = 0; iteration < max_iterations; ++iteration) {
+    double change = 0.0;
+    for (int attempt = 0; attempt < 12 && !(change > 0.0); ++attempt) {
+      const double expected = system.propose(damping);
+      if (expected >= 0.0 && expected <= 0.1 * tolerance * cost) return true;
+      const double next = expected >= 0.0 ? system.build() : HUGE_VAL;
+      if (next < cost) {
+        change = cost - next;
+        cost = next;
+        const double surprise = 2.0 * change / expected - 1.0;
+        damping = std::max(damping * std::max(0.1, 1.0 - std::pow(surprise, 3)), 1e-12);
+        growth = 2.0;
+        system.accept();
+      } else {
+        damping *= growth;
+        growth *= 2.0;
+      }
+    }
+    if (change <= tolerance * cost) break;
+  }
+  return true;
+}
+
+/// A copy with a larger diagonal, so that a step is shorter and there is one at all.
+template <typename Matrix>
+Matrix damped(Matrix matrix, double damping) {
+  const double least = 1e-12 * matrix.diagonal().maxCoeff();
+  matrix.diagonal() *= 1.0 + damping;
+  matrix.diagonal().array() += least;
+  return matrix;
+}
+
+/// J^T J and J^T r of the whole problem: what is shared (lens parameters, warp, rig and axis, in
+/// that order, those that are free), and one pose each.
+struct Equations {
+  Eigen::MatrixXd shared;  ///< lower and upper
+  Eigen::VectorXd gradient;
+  std::vector<Eigen::Matrix<double, 6, 6>> pose;
+  std::vector<Vector6d> pose_gradient;
+  std::vector<Eigen::MatrixXd> coupling;  ///< empty for poses that no view has
+};
+
+/// The whole problem, its poses eliminated from each step (Schur's complement).
+class BundleSystem {
  public:
-  NormalEquations(const std::vector<BundleView>& views, const BundleOptions& options,
-                  const BundleState& state)
-      : views_(views), options_(options) {
+  BundleSystem(const std::vector<BundleView>& views, const BundleOptions& options,
+               const BundleState& state)
+      : views_(views), options_(options), now_(state), trial_(state) {
     for (const LensPtr& lens : state.lenses) {
       lens_column_.push_back(columns_);
       if (options.lens) columns_ += static_cast<int>(lens->parameters().size());
@@ -146,143 +215,196 @@ class NormalEquations {
     axis_steps_ = options.axis_length ? Eigen::MatrixXd(Eigen::Matrix3d::Identity())
                                       : Eigen::MatrixXd(axisTangents(state.axis));
     columns_ += options.axis ? static_cast<int>(axis_steps_.cols()) : 0;
-    poses_ = state.poses.size();
   }
 
-  /// Sums up at `blocks`. @return the cost: the sum of the loss over all corners; infinite when a
-  /// lens is none
-  double build(const Blocks& blocks, double loss_px, bool derivatives) {
-    if (derivatives) {
-      shared = Eigen::MatrixXd::Zero(columns_, columns_);
-      gradient = Eigen::VectorXd::Zero(columns_);
-      pose.assign(poses_, Eigen::Matrix<double, 6, 6>::Zero());
-      pose_gradient.assign(poses_, Vector6d::Zero());
-      coupling.assign(poses_, Eigen::MatrixXd());
-    }
+  double build() {
+    const std::size_t poses = trial_.pose_blocks.size();
+    sums_.shared = Eigen::MatrixXd::Zero(columns_, columns_);
+    sums_.gradient = Eigen::VectorXd::Zero(columns_);
+    sums_.pose.assign(poses, Eigen::Matrix<double, 6, 6>::Zero());
+    sums_.pose_gradient.assign(poses, Vector6d::Zero());
+    sums_.coupling.assign(poses, Eigen::MatrixXd());
     double cost = 0.0;
-    Linearization corner;
-    std::vector<int> active;
-    std::vector<Eigen::Vector2d> row;
     for (const BundleView& view : views_) {
-      const LensPtr& lens = blocks.lenses[view.camera];
-      if (!lens) return HUGE_VAL;
-      const PoseValue* rig = view.camera == 1 ? &*blocks.rig_value : nullptr;
-      if (derivatives && coupling[view.pose].size() == 0) {
-        coupling[view.pose] = Eigen::MatrixXd::Zero(columns_, 6);
+      if (!trial_.lenses[view.camera]) return HUGE_VAL;
+      if (sums_.coupling[view.pose].size() == 0) {
+        sums_.coupling[view.pose] = Eigen::MatrixXd::Zero(columns_, 6);
       }
-      for (const Corner& c : *view.corners) {
-        linearize(*lens, blocks.poses[view.pose], rig, blocks.warp, view.travel * blocks.axis, c,
-                  derivatives, corner);
-        const double s = corner.residual.squaredNorm();
-        cost += loss_px > 0.0 ? loss_px * loss_px * std::log1p(s / (loss_px * loss_px)) : s;
-        if (!derivatives) continue;
-        active.clear();
-        row.clear();
-        const auto add = [&](int column, const Eigen::Vector2d& slope) {
-          // A grid has many control points, of which few matter to a corner.
-          if (slope.x() == 0.0 && slope.y() == 0.0) return;
-          active.push_back(column);
-          row.push_back(slope);
-        };
-        if (options_.lens) {
-          for (int k = 0; k < corner.d_lens.cols(); ++k) {
-            add(lens_column_[view.camera] + k, corner.d_lens.col(k));
-          }
-        }
-        if (options_.warp) {
-          add(warp_column_, corner.d_k1);
-          add(warp_column_ + 1, corner.d_k2);
-        }
-        if (options_.rig && rig) {
-          for (int k = 0; k < 6; ++k) add(rig_column_ + k, corner.d_rig.col(k));
-        }
-        if (options_.axis) {
-          for (int k = 0; k < axis_steps_.cols(); ++k) {
-            add(axis_column_ + k, -view.travel * corner.d_point * axis_steps_.col(k));
-          }
-        }
-        const double weight = cauchyWeight(s, loss_px);
-        Eigen::MatrixXd& couple = coupling[view.pose];
-        for (std::size_t a = 0; a < active.size(); ++a) {
-          const Eigen::Vector2d weighted = weight * row[a];
-          for (std::size_t b = 0; b <= a; ++b) shared(active[a], active[b]) += weighted.dot(row[b]);
-          gradient[active[a]] += weighted.dot(corner.residual);
-          couple.row(active[a]).noalias() += weighted.transpose() * corner.d_pose;
-        }
-        pose[view.pose].noalias() += weight * corner.d_pose.transpose() * corner.d_pose;
-        pose_gradient[view.pose].noalias() += weight * corner.d_pose.transpose() * corner.residual;
-      }
+      cost += options_.lens && grid_size_[view.camera] > 0 ? addSparse(view) : addDense(view);
     }
     for (std::size_t i = 0; i < grid_size_.size(); ++i) {
       if (!options_.lens || grid_size_[i] == 0) continue;
-      const Eigen::Index size = blocks.lens_blocks[i].size();
-      const auto points = blocks.lens_blocks[i].tail(grid_size_[i]);
+      const auto points = trial_.lens_blocks[i].tail(grid_size_[i]);
+      const Eigen::Index first = lens_column_[i] + trial_.lens_blocks[i].size() - grid_size_[i];
       cost += kGridWeight * kGridWeight * points.squaredNorm();
-      if (!derivatives) continue;
-      const Eigen::Index first = lens_column_[i] + size - grid_size_[i];
-      gradient.segment(first, grid_size_[i]) += kGridWeight * kGridWeight * points;
-      shared.diagonal().segment(first, grid_size_[i]).array() += kGridWeight * kGridWeight;
+      sums_.gradient.segment(first, grid_size_[i]) += kGridWeight * kGridWeight * points;
+      sums_.shared.diagonal().segment(first, grid_size_[i]).array() += kGridWeight * kGridWeight;
     }
-    if (derivatives) shared = Eigen::MatrixXd(shared.selfadjointView<Eigen::Lower>());
+    sums_.shared = Eigen::MatrixXd(sums_.shared.selfadjointView<Eigen::Lower>());
     return std::isfinite(cost) ? cost : HUGE_VAL;
   }
 
-  /// Moves the blocks by the step that solves the equations with a damped diagonal.
-  /// @return false for equations without a solution
-  bool step(double damping, Blocks& blocks) const {
-    const auto damped = [&](auto matrix) {
-      const double least = 1e-12 * matrix.diagonal().maxCoeff();
-      matrix.diagonal() *= 1.0 + damping;
-      matrix.diagonal().array() += least;
-      return matrix;
-    };
-    Eigen::MatrixXd reduced = damped(shared);
-    Eigen::VectorXd right = -gradient;
-    std::vector<Eigen::LDLT<Eigen::Matrix<double, 6, 6>>> inverse(poses_);
-    for (std::size_t i = 0; i < poses_; ++i) {
-      if (coupling[i].size() == 0) continue;
-      inverse[i].compute(damped(pose[i]));
-      reduced.noalias() -= coupling[i] * inverse[i].solve(coupling[i].transpose());
-      right += coupling[i] * inverse[i].solve(pose_gradient[i]);
+  void accept() {
+    std::swap(now_, trial_);
+    std::swap(equations_, sums_);
+  }
+
+  double propose(double damping) {
+    const Equations& e = equations_;
+    Eigen::MatrixXd reduced = columns_ > 0 ? damped(e.shared, damping) : e.shared;
+    Eigen::VectorXd right = -e.gradient;
+    std::vector<Eigen::LDLT<Eigen::Matrix<double, 6, 6>>> inverse(e.pose.size());
+    for (std::size_t i = 0; i < e.pose.size(); ++i) {
+      if (!used(i)) continue;
+      inverse[i].compute(damped(e.pose[i], damping));
+      reduced.noalias() -= e.coupling[i] * inverse[i].solve(e.coupling[i].transpose());
+      right += e.coupling[i] * inverse[i].solve(e.pose_gradient[i]);
     }
-    // Parameters differ by many orders of magnitude.
-    const Eigen::VectorXd scale = reduced.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
-    const Eigen::MatrixXd scaled = scale.asDiagonal() * reduced * scale.asDiagonal();
-    const Eigen::VectorXd change =
-        scale.cwiseProduct(scaled.ldlt().solve(scale.cwiseProduct(right)));
-    if (!change.allFinite()) return false;
-    for (std::size_t i = 0; i < poses_; ++i) {
-      if (coupling[i].size() == 0) continue;
+    Eigen::VectorXd change = right;
+    if (columns_ > 0) {
+      // Parameters differ by many orders of magnitude.
+      const Eigen::VectorXd scale = reduced.diagonal().cwiseMax(1e-300).cwiseSqrt().cwiseInverse();
+      const Eigen::MatrixXd scaled = scale.asDiagonal() * reduced * scale.asDiagonal();
+      change = scale.cwiseProduct(scaled.ldlt().solve(scale.cwiseProduct(right)));
+    }
+    if (!change.allFinite()) return -1.0;
+    double expected = -e.gradient.dot(change);
+    trial_ = now_;
+    for (std::size_t i = 0; i < e.pose.size(); ++i) {
+      if (!used(i)) continue;
       const Vector6d move =
-          -inverse[i].solve(Vector6d(pose_gradient[i] + coupling[i].transpose() * change));
-      if (!move.allFinite()) return false;
-      blocks.pose_blocks[i] += move;
+          -inverse[i].solve(Vector6d(e.pose_gradient[i] + e.coupling[i].transpose() * change));
+      if (!move.allFinite()) return -1.0;
+      expected -= e.pose_gradient[i].dot(move);
+      trial_.pose_blocks[i] += move;
     }
     if (options_.lens) {
       for (std::size_t i = 0; i < lens_column_.size(); ++i) {
-        blocks.lens_blocks[i] += change.segment(lens_column_[i], blocks.lens_blocks[i].size());
+        trial_.lens_blocks[i] += change.segment(lens_column_[i], trial_.lens_blocks[i].size());
       }
     }
-    if (options_.warp) blocks.warp += change.segment<2>(warp_column_);
-    if (options_.rig) blocks.rig += change.segment<6>(rig_column_);
+    if (options_.warp) trial_.warp += change.segment<2>(warp_column_);
+    if (options_.rig) trial_.rig += change.segment<6>(rig_column_);
     if (options_.axis) {
-      const double length = blocks.axis.norm();
-      blocks.axis += axis_steps_ * change.segment(axis_column_, axis_steps_.cols());
-      if (!options_.axis_length) blocks.axis *= length / blocks.axis.norm();
+      const double length = trial_.axis.norm();
+      trial_.axis += axis_steps_ * change.segment(axis_column_, axis_steps_.cols());
+      if (!options_.axis_length) trial_.axis *= length / trial_.axis.norm();
     }
-    blocks.prepare();
-    return true;
+    trial_.prepare();
+    return expected;
   }
 
-  Eigen::MatrixXd shared;  ///< lower and upper
-  Eigen::VectorXd gradient;
-  std::vector<Eigen::Matrix<double, 6, 6>> pose;
-  std::vector<Vector6d> pose_gradient;
-  std::vector<Eigen::MatrixXd> coupling;  ///< empty for poses that no view has
+  bool used(std::size_t pose) const { return equations_.coupling[pose].size() > 0; }
+  const Equations& equations() const { return equations_; }
+  BundleState state() const { return now_.state(); }
 
  private:
+  void linearizeAt(const BundleView& view, const Corner& corner, Linearization& out) const {
+    const PoseValue* rig = view.camera == 1 ? &*trial_.rig_value : nullptr;
+    linearize(*trial_.lenses[view.camera], trial_.poses[view.pose], rig, trial_.warp,
+              view.travel * trial_.axis, corner, true, out);
+  }
+
+  /// Calls with each shared parameter's column and the slope of a corner's residual by it.
+  template <typename Add>
+  void forEachColumn(const BundleView& view, const Linearization& corner, const Add& add) const {
+    if (options_.lens) {
+      for (int k = 0; k < corner.d_lens.cols(); ++k) {
+        add(lens_column_[view.camera] + k, corner.d_lens.col(k));
+      }
+    }
+    if (options_.warp) {
+      add(warp_column_, corner.d_k1);
+      add(warp_column_ + 1, corner.d_k2);
+    }
+    if (options_.rig && view.camera == 1) {
+      for (int k = 0; k < 6; ++k) add(rig_column_ + k, corner.d_rig.col(k));
+    }
+    if (options_.axis) {
+      for (int k = 0; k < axis_steps_.cols(); ++k) {
+        add(axis_column_ + k, -view.travel * corner.d_point * axis_steps_.col(k));
+      }
+    }
+  }
+
+  /// All corners of a view as one matrix [shared columns it has | pose | residual], squared at
+  /// once.
+  double addDense(const BundleView& view) {
+    const auto count = static_cast<Eigen::Index>(view.corners->size());
+    place_.clear();
+    double cost = 0.0;
+    Linearization corner;
+    Eigen::Index width = 0;
+    for (Eigen::Index i = 0; i < count; ++i) {
+      linearizeAt(view, (*view.corners)[static_cast<std::size_t>(i)], corner);
+      if (i == 0) {
+        forEachColumn(view, corner, [&](int column, const auto&) { place_.push_back(column); });
+        width = static_cast<Eigen::Index>(place_.size());
+        rows_.resize(2 * count, width + 7);
+      }
+      auto row = rows_.middleRows<2>(2 * i);
+      Eigen::Index next = 0;
+      forEachColumn(view, corner, [&](int, const auto& slope) { row.col(next++) = slope; });
+      row.middleCols<6>(width) = corner.d_pose;
+      const Robust robust(corner.residual, options_.loss_px);
+      cost += robust.cost;
+      for (Eigen::Index k = 0; k < width + 6; ++k) row.col(k) = robust.chain * row.col(k);
+      row.col(width + 6) = robust.residual;
+    }
+    if (count == 0) return 0.0;
+    squares_.setZero(width + 7, width + 7);
+    squares_.selfadjointView<Eigen::Lower>().rankUpdate(rows_.transpose());
+    for (Eigen::Index a = 0; a < width; ++a) {
+      const int column = place_[static_cast<std::size_t>(a)];
+      for (Eigen::Index b = 0; b <= a; ++b) {
+        sums_.shared(column, place_[static_cast<std::size_t>(b)]) += squares_(a, b);
+      }
+      sums_.gradient[column] += squares_(width + 6, a);
+      sums_.coupling[view.pose].row(column) += squares_.block<6, 1>(width, a).transpose();
+    }
+    sums_.pose[view.pose] += Eigen::Matrix<double, 6, 6>(squares_.block<6, 6>(width, width))
+                                 .selfadjointView<Eigen::Lower>();
+    sums_.pose_gradient[view.pose] += squares_.block<1, 6>(width + 6, width).transpose();
+    return cost;
+  }
+
+  /// The same corner by corner, for a grid: it has many control points, of which few matter to a
+  /// corner.
+  double addSparse(const BundleView& view) {
+    double cost = 0.0;
+    Linearization corner;
+    Eigen::MatrixXd& couple = sums_.coupling[view.pose];
+    for (const Corner& c : *view.corners) {
+      linearizeAt(view, c, corner);
+      const Robust robust(corner.residual, options_.loss_px);
+      const Eigen::Matrix<double, 2, 6> d_pose = robust.chain * corner.d_pose;
+      cost += robust.cost;
+      place_.clear();
+      slopes_.clear();
+      forEachColumn(view, corner, [&](int column, const Eigen::Vector2d& slope) {
+        if (slope.x() == 0.0 && slope.y() == 0.0) return;
+        place_.push_back(column);
+        slopes_.push_back(robust.chain * slope);
+      });
+      for (std::size_t a = 0; a < place_.size(); ++a) {
+        for (std::size_t b = 0; b <= a; ++b) {
+          sums_.shared(place_[a], place_[b]) += slopes_[a].dot(slopes_[b]);
+        }
+        sums_.gradient[place_[a]] += slopes_[a].dot(robust.residual);
+        couple.row(place_[a]).noalias() += slopes_[a].transpose() * d_pose;
+      }
+      sums_.pose[view.pose].noalias() += d_pose.transpose() * d_pose;
+      sums_.pose_gradient[view.pose].noalias() += d_pose.transpose() * robust.residual;
+    }
+    return cost;
+  }
+
   const std::vector<BundleView>& views_;
   const BundleOptions& options_;
+  Blocks now_;
+  Blocks trial_;
+  Equations equations_;
+  Equations sums_;
   std::vector<int> lens_column_;
   std::vector<int> grid_size_;
   int warp_column_ = 0;
@@ -290,133 +412,73 @@ class NormalEquations {
   int axis_column_ = 0;
   int columns_ = 0;
   Eigen::MatrixXd axis_steps_;
-  std::size_t poses_ = 0;
+  // Room to work in.
+  std::vector<int> place_;
+  std::vector<Eigen::Vector2d> slopes_;
+  RowMajor rows_;
+  Eigen::MatrixXd squares_;
 };
 
-/// Levenberg and Marquardt on the normal equations: for lenses with a grid, whose Jacobians are
-/// sparse within their one block.
-bool adjustByNormalEquations(const std::vector<BundleView>& views, const BundleOptions& options,
-                             BundleState& state) {
-  Blocks blocks(state);
-  NormalEquations equations(views, options, state);
-  double damping = 1e-4;
-  double cost = equations.build(blocks, options.loss_px, true);
-  if (!(cost < HUGE_VAL)) return false;
-  for (int iteration = 0; iteration < options.max_iterations; ++iteration) {
-    bool improved = false;
-    double change = 0.0;
-    const auto lens_before = blocks.lens_blocks;
-    const auto poses_before = blocks.pose_blocks;
-    const Eigen::Vector2d warp_before = blocks.warp;
-    const Vector6d rig_before = blocks.rig;
-    const Eigen::Vector3d axis_before = blocks.axis;
-    for (int attempt = 0; attempt < 12 && !improved; ++attempt) {
-      const double next = equations.step(damping, blocks)
-                              ? equations.build(blocks, options.loss_px, false)
-                              : HUGE_VAL;
-      if (next < cost) {
-        change = cost - next;
-        cost = next;
-        damping = std::max(0.1 * damping, 1e-12);
-        improved = true;
-        break;
-      }
-      damping *= 10.0;
-      blocks.lens_blocks = lens_before;
-      blocks.pose_blocks = poses_before;
-      blocks.warp = warp_before;
-      blocks.rig = rig_before;
-      blocks.axis = axis_before;
-      blocks.prepare();
-    }
-    if (!improved || change <= options.tolerance * cost) break;
-    equations.build(blocks, options.loss_px, true);
-  }
-  state = blocks.state();
-  return true;
-}
-
-/// All corners of a view in one residual block: Ceres' book-keeping then costs little beside the
-/// projections. The loss acts on each corner: the residual handed over is g(r) = r sqrt(rho(s) / s)
-/// with s = |r|^2, whose squared length is rho(s), and its exact derivative.
-class ViewCost : public ceres::CostFunction {
+/// One pose, everything else fixed.
+class PoseSystem {
  public:
-  ViewCost(const BundleView& view, const Blocks& blocks, double loss_px, bool with_axis)
-      : view_(view), blocks_(blocks), loss_px_(loss_px), with_axis_(with_axis) {
-    set_num_residuals(2 * static_cast<int>(view.corners->size()));
-    auto* sizes = mutable_parameter_block_sizes();
-    sizes->push_back(static_cast<int>(blocks.lens_blocks[view.camera].size()));
-    sizes->push_back(6);
-    sizes->push_back(2);
-    if (view.camera == 1) sizes->push_back(6);
-    if (with_axis) sizes->push_back(3);
-  }
+  PoseSystem(const std::vector<BundleView>& views, double loss_px, const BundleState& state)
+      : views_(views),
+        loss_px_(loss_px),
+        state_(state),
+        rig_(blockOf(state.T_right_left).data()),
+        now_(blockOf(state.poses[views.front().pose])),
+        trial_(now_) {}
 
-  std::vector<double*> parameterBlocks(Blocks& blocks) const {
-    std::vector<double*> result = {blocks.lens_blocks[view_.camera].data(),
-                                   blocks.pose_blocks[view_.pose].data(), blocks.warp.data()};
-    if (view_.camera == 1) result.push_back(blocks.rig.data());
-    if (with_axis_) result.push_back(blocks.axis.data());
-    return result;
-  }
-
-  bool Evaluate(double const* const*, double* residuals, double** jacobians) const override {
-    const LensPtr& lens = blocks_.lenses[view_.camera];
-    if (!lens) return false;
-    const PoseValue& pose = blocks_.poses[view_.pose];
-    const PoseValue* rig = view_.camera == 1 ? &*blocks_.rig_value : nullptr;
-    const Eigen::Vector3d shift = view_.travel * blocks_.axis;
+  double build() {
+    const PoseValue pose(trial_.data());
     Linearization corner;
-    Eigen::Matrix<double, 2, 3> d_axis;
-    for (std::size_t i = 0; i < view_.corners->size(); ++i) {
-      linearize(*lens, pose, rig, blocks_.warp, shift, (*view_.corners)[i], jacobians != nullptr,
-                corner);
-      // g = gain r;  dg = (gain I + slope r r^T) dr
-      const Eigen::Vector2d r = corner.residual;
-      const double s = r.squaredNorm();
-      double gain = 1.0;
-      double slope = 0.0;
-      if (loss_px_ > 0.0) {
-        const double c2 = loss_px_ * loss_px_;
-        const double x = s / c2;
-        if (x < 1e-6) {
-          gain = 1.0 - 0.25 * x;
-          slope = -0.5 / c2;
-        } else {
-          const double rho = c2 * std::log1p(x);
-          gain = std::sqrt(rho / s);
-          slope = (s / (1.0 + x) - rho) / (gain * s * s);
-        }
-      }
-      Eigen::Map<Eigen::Vector2d>(residuals + 2 * i) = gain * r;
-      if (jacobians == nullptr) continue;
-      const Eigen::Matrix2d chain = gain * Eigen::Matrix2d::Identity() + slope * r * r.transpose();
-      const auto store = [&](int block, const auto& derivative) {
-        if (jacobians[block] == nullptr) return;
-        const int columns = static_cast<int>(derivative.cols());
-        Eigen::Map<RowMajor>(jacobians[block] + 2 * i * columns, 2, columns).noalias() =
-            chain * derivative;
-      };
-      store(0, corner.d_lens);
-      store(1, corner.d_pose);
-      Eigen::Matrix2d d_warp;
-      d_warp << corner.d_k1, corner.d_k2;
-      store(2, d_warp);
-      int next = 3;
-      if (rig) store(next++, corner.d_rig);
-      if (with_axis_) {
-        d_axis = -view_.travel * corner.d_point;
-        store(next, d_axis);
+    trial_hessian_.setZero();
+    trial_gradient_.setZero();
+    trial_squares_ = 0.0;
+    double cost = 0.0;
+    for (const BundleView& view : views_) {
+      const PoseValue* rig = view.camera == 1 ? &rig_ : nullptr;
+      for (const Corner& c : *view.corners) {
+        linearize(*state_.lenses[view.camera], pose, rig, state_.warp, view.travel * state_.axis, c,
+                  true, corner);
+        const Robust robust(corner.residual, loss_px_);
+        const Eigen::Matrix<double, 2, 6> slope = robust.chain * corner.d_pose;
+        trial_squares_ += corner.residual.squaredNorm();
+        cost += robust.cost;
+        trial_hessian_.noalias() += slope.transpose() * slope;
+        trial_gradient_.noalias() += slope.transpose() * robust.residual;
       }
     }
-    return true;
+    return std::isfinite(cost) ? cost : HUGE_VAL;
   }
+
+  void accept() {
+    now_ = trial_;
+    hessian_ = trial_hessian_;
+    gradient_ = trial_gradient_;
+    squares_ = trial_squares_;
+  }
+
+  double propose(double damping) {
+    const Vector6d step = damped(hessian_, damping).ldlt().solve(-gradient_);
+    trial_ = now_ + step;
+    return step.allFinite() ? -gradient_.dot(step) : -1.0;
+  }
+
+  Pose pose() const { return poseOf(now_); }
+  double squares() const { return squares_; }
 
  private:
-  const BundleView& view_;
-  const Blocks& blocks_;
+  const std::vector<BundleView>& views_;
   double loss_px_;
-  bool with_axis_;
+  const BundleState& state_;
+  PoseValue rig_;
+  Vector6d now_, trial_;
+  Eigen::Matrix<double, 6, 6> hessian_, trial_hessian_;
+  Vector6d gradient_, trial_gradient_;
+  double squares_ = 0.0;
+  double trial_squares_ = 0.0;
 };
 
 }  // namespace
@@ -474,139 +536,21 @@ std::vector<Eigen::Vector2d> residualsOf(const BundleView& view, const BundleSta
 
 bool adjust(const std::vector<BundleView>& views, const BundleOptions& options,
             BundleState& state) {
-  for (const LensPtr& lens : state.lenses) {
-    if (options.lens && structureOf(*lens).grid > 0) {
-      return adjustByNormalEquations(views, options, state);
-    }
-  }
-  Blocks blocks(state);
-  ceres::Problem::Options problem_options;
-  problem_options.evaluation_callback = &blocks;
-  ceres::Problem problem(problem_options);
-  bool used_right = false;
-  std::vector<bool> used_lens(state.lenses.size(), false);
-  std::vector<bool> used_pose(state.poses.size(), false);
-  for (const BundleView& view : views) {
-    auto cost = std::make_unique<ViewCost>(view, blocks, options.loss_px, options.axis);
-    const auto parameters = cost->parameterBlocks(blocks);
-    problem.AddResidualBlock(cost.release(), nullptr, parameters);
-    used_right = used_right || view.camera == 1;
-    used_lens[view.camera] = true;
-    used_pose[view.pose] = true;
-  }
-  auto ordering = std::make_shared<ceres::ParameterBlockOrdering>();
-  for (std::size_t i = 0; i < blocks.pose_blocks.size(); ++i) {
-    if (used_pose[i]) ordering->AddElementToGroup(blocks.pose_blocks[i].data(), 0);
-  }
-  bool any_shared = false;
-  const auto shared = [&](double* block, bool free) {
-    ordering->AddElementToGroup(block, 1);
-    if (free) {
-      any_shared = true;
-    } else {
-      problem.SetParameterBlockConstant(block);
-    }
-  };
-  for (std::size_t i = 0; i < blocks.lens_blocks.size(); ++i) {
-    if (used_lens[i]) shared(blocks.lens_blocks[i].data(), options.lens);
-  }
-  shared(blocks.warp.data(), options.warp);
-  if (used_right) shared(blocks.rig.data(), options.rig);
-  if (options.axis) {
-    shared(blocks.axis.data(), true);
-    if (!options.axis_length) {
-      problem.SetManifold(blocks.axis.data(), new ceres::SphereManifold<3>);
-    }
-  }
-
-  ceres::Solver::Options solver;
-  // One thread: sums then run in one order, so the result is the same on every machine size. Work
-  // is shared out over folds and candidates instead.
-  solver.num_threads = 1;
-  solver.linear_solver_type = any_shared ? ceres::DENSE_SCHUR : ceres::DENSE_QR;
-  if (any_shared) solver.linear_solver_ordering = ordering;
-  solver.max_num_iterations = options.max_iterations;
-  solver.function_tolerance = options.tolerance;
-  solver.parameter_tolerance = 1e-12;
-  solver.gradient_tolerance = 1e-14;
-  solver.max_num_consecutive_invalid_steps = 20;
-  solver.logging_type = ceres::SILENT;
-  ceres::Solver::Summary summary;
-  ceres::Solve(solver, &problem, &summary);
-  if (!summary.IsSolutionUsable() || !std::isfinite(summary.final_cost)) return false;
-  BundleState result = blocks.state();
-  for (const LensPtr& lens : result.lenses) {
-    if (!lens) return false;
-  }
-  if (options.axis && !options.axis_length) result.axis *= state.axis.norm() / result.axis.norm();
-  state = std::move(result);
+  BundleSystem system(views, options, state);
+  if (!minimise(system, options.max_iterations, options.tolerance)) return false;
+  state = system.state();
   return true;
 }
 
 double refinePose(const std::vector<BundleView>& views, double loss_px, BundleState& state,
                   int max_iterations) {
-  const int index = views.front().pose;
-  Vector6d block = blockOf(state.poses[index]);
-  const std::optional<PoseValue> rig_value(blockOf(state.T_right_left).data());
-  Linearization corner;
-  const auto evaluate = [&](const Vector6d& at, Eigen::Matrix<double, 6, 6>* hessian,
-                            Vector6d* gradient, double* squares) {
-    const PoseValue pose(at.data());
-    double cost = 0.0;
-    *squares = 0.0;
-    for (const BundleView& view : views) {
-      const PoseValue* rig = view.camera == 1 ? &*rig_value : nullptr;
-      const Eigen::Vector3d shift = view.travel * state.axis;
-      for (const Corner& c : *view.corners) {
-        linearize(*state.lenses[view.camera], pose, rig, state.warp, shift, c, hessian != nullptr,
-                  corner);
-        const double s = corner.residual.squaredNorm();
-        *squares += s;
-        cost += loss_px > 0.0 ? loss_px * loss_px * std::log1p(s / (loss_px * loss_px)) : s;
-        if (hessian == nullptr) continue;
-        const double weight = cauchyWeight(s, loss_px);
-        hessian->noalias() += weight * corner.d_pose.transpose() * corner.d_pose;
-        gradient->noalias() += weight * corner.d_pose.transpose() * corner.residual;
-      }
-    }
-    return cost;
-  };
-
-  double damping = 1e-4;
-  double squares = 0.0;
-  double cost = evaluate(block, nullptr, nullptr, &squares);
+  PoseSystem system(views, loss_px, state);
   std::size_t count = 0;
   for (const BundleView& view : views) count += view.corners->size();
-  for (int iteration = 0; iteration < max_iterations; ++iteration) {
-    Eigen::Matrix<double, 6, 6> hessian = Eigen::Matrix<double, 6, 6>::Zero();
-    Vector6d gradient = Vector6d::Zero();
-    evaluate(block, &hessian, &gradient, &squares);
-    bool improved = false;
-    double change = 0.0;
-    for (int attempt = 0; attempt < 10 && !improved; ++attempt) {
-      Eigen::Matrix<double, 6, 6> damped = hessian;
-      damped.diagonal() *= 1.0 + damping;
-      damped.diagonal().array() += 1e-12 * hessian.diagonal().maxCoeff();
-      const Vector6d step = damped.ldlt().solve(-gradient);
-      const Vector6d next = block + step;
-      double next_squares = 0.0;
-      const double next_cost =
-          step.allFinite() ? evaluate(next, nullptr, nullptr, &next_squares) : HUGE_VAL;
-      if (next_cost < cost) {
-        change = cost - next_cost;
-        block = next;
-        cost = next_cost;
-        squares = next_squares;
-        damping = std::max(damping * 0.1, 1e-12);
-        improved = true;
-      } else {
-        damping *= 10.0;
-      }
-    }
-    if (!improved || change < 1e-12 * cost) break;
-  }
-  state.poses[index] = poseOf(block);
-  return std::sqrt(squares / static_cast<double>(count));
+  if (!minimise(system, max_iterations, 1e-12)) return HUGE_VAL;
+  const double rms = std::sqrt(system.squares() / static_cast<double>(count));
+  state.poses[views.front().pose] = system.pose();
+  return rms;
 }
 
 Eigen::Matrix<double, 3, 2> axisTangents(const Eigen::Vector3d& axis) {
@@ -622,13 +566,16 @@ Eigen::Matrix<double, 3, 2> axisTangents(const Eigen::Vector3d& axis) {
 
 Eigen::MatrixXd reducedInformation(const std::vector<BundleView>& views,
                                    const BundleOptions& options, const BundleState& state) {
-  const Blocks blocks(state);
-  NormalEquations equations(views, options, state);
-  equations.build(blocks, 0.0, true);
+  BundleOptions plain = options;
+  plain.loss_px = 0.0;
+  BundleSystem system(views, plain, state);
+  system.build();
+  system.accept();
+  const Equations& equations = system.equations();
   Eigen::MatrixXd information = equations.shared;
   for (std::size_t i = 0; i < state.poses.size(); ++i) {
+    if (!system.used(i)) continue;
     const Eigen::MatrixXd& coupling = equations.coupling[i];
-    if (coupling.size() == 0) continue;
     information.noalias() -= coupling * equations.pose[i].ldlt().solve(coupling.transpose());
   }
   return 0.5 * (information + information.transpose());

@@ -240,7 +240,7 @@ class StructureChoice {
     std::vector<std::optional<Tried>> results(structures.size());
     parallelFor(0, structures.size(), options_.threads, [&](std::size_t i) {
       const LensStructure& structure = structures[i];
-      auto fit = refit(input_, from, structure);
+      auto fit = refit(input_, from, structure, kTrialTolerance);
       if (!fit) return;
       Tried tried;
       tried.structure = structure;
@@ -341,8 +341,8 @@ Selection selectStructure(const FitInput& input, const Fit& first,
     const std::string middling = model == "auto" ? "asphere" : model;
     std::vector<LensStructure> carried;
     for (const bool affinity : {false, true}) {
-      carried.push_back(make(middling, 2, 7, affinity, false));
-      if (rich) carried.push_back(make(middling, 2, 7, affinity, true));
+      carried.push_back(make(middling, 1, 7, affinity, false));
+      if (rich) carried.push_back(make(middling, 1, 7, affinity, true));
     }
     choice.consider(many ? std::vector<LensStructure>{carried.front(), carried.back()} : carried,
                     first);
@@ -397,6 +397,7 @@ Selection selectStructure(const FitInput& input, const Fit& first,
     selection.candidates.push_back(candidate);
   }
   selection.fit = chosen->fit;
+  polish(input, selection.fit);
   selection.holdout_rms_px = chosen->holdout;
   return selection;
 }
@@ -739,7 +740,7 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
 
   report(0.96, "estimating uncertainty");
   // The next richer model tells what the chosen one cannot say.
-  const auto compared = refit(input, fit, richerThan(fit.structure));
+  const auto compared = refit(input, fit, richerThan(fit.structure), kTrialTolerance);
   CalibrationResult result = assembleResult(prepared, selection, options, covariance, compared);
   if (input.stage) {
     const StageResult stage = judgeStage(input, fit, result.warnings);

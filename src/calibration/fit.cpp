@@ -61,9 +61,10 @@ std::vector<Eigen::Vector3d> directions(double max_theta) {
 bool settle(const FitInput& input, const std::vector<BundleView>& views, BundleOptions options,
             Fit& fit) {
   constexpr int kRounds = 4;
+  const double tolerance = options.tolerance;
   for (int round = 0; round < kRounds; ++round) {
     options.loss_px = lossFor(fit.sigma_px);
-    options.tolerance = round == 0 ? 1e-5 : 1e-10;
+    options.tolerance = round == 0 ? std::max(1e-5, tolerance) : tolerance;
     if (!adjust(views, options, fit.state)) return false;
     fit.loss_px = options.loss_px;
     fit.sigma_px = statisticsOf(residualsOf(input, fit.state)).sigma_px;
@@ -77,6 +78,13 @@ bool settle(const FitInput& input, const std::vector<BundleView>& views, BundleO
     if (round > 0 && steady && lossFor(fit.sigma_px) > 0.8 * fit.loss_px) break;
   }
   return std::isfinite(fit.sigma_px);
+}
+
+/// Gives the fitted lens the field that it is to have in the end.
+void widen(const FitInput& input, Fit& fit) {
+  const double reached =
+      fieldFor(outermostAngle(input, fit.state, fit.sigma_px), fit.structure.model, kFieldMargin);
+  if (reached > 0.0) fit.state.lenses[0] = withField(fit.state.lenses[0], reached);
 }
 
 }  // namespace
@@ -310,7 +318,8 @@ std::optional<Fit> firstFit(const FitInput& input, int threads, std::vector<bool
   return best;
 }
 
-std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStructure& structure) {
+std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStructure& structure,
+                         double tolerance) {
   const LensModel& known = *from.state.lenses[0];
   const double outermost = outermostAngle(input, from.state, from.sigma_px);
   if (!(outermost > 0.0)) return std::nullopt;
@@ -342,11 +351,19 @@ std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStruc
     if (!sight.empty()) refinePose(sight, 0.0, fit.state, 3);
   }
   fit.sigma_px = std::max(from.sigma_px, statisticsOf(residualsOf(input, fit.state)).sigma_px);
+  options.tolerance = tolerance;
   if (!settle(input, views, options, fit)) return std::nullopt;
-  const double reached =
-      fieldFor(outermostAngle(input, fit.state, fit.sigma_px), structure.model, kFieldMargin);
-  if (reached > 0.0) fit.state.lenses[0] = withField(fit.state.lenses[0], reached);
+  widen(input, fit);
   return fit;
+}
+
+void polish(const FitInput& input, Fit& fit) {
+  Fit polished = fit;
+  BundleOptions options = input.freedom();
+  options.tolerance = kPolishTolerance;
+  if (!settle(input, bundleViews(input), options, polished)) return;
+  widen(input, polished);
+  fit = std::move(polished);
 }
 
 std::optional<double> holdoutRms(const FitInput& input, const Fit& fit, int folds, int threads) {
@@ -369,7 +386,7 @@ std::optional<double> holdoutRms(const FitInput& input, const Fit& fit, int fold
     BundleState state = fit.state;
     BundleOptions options = input.freedom();
     options.loss_px = fit.loss_px;
-    options.tolerance = 1e-8;
+    options.tolerance = kTrialTolerance;
     if (known.size() < 3 || !adjust(known, options, state)) {
       sum.failed = true;
       return;

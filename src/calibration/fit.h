@@ -68,8 +68,18 @@ std::vector<std::vector<Eigen::Vector2d>> residualsOf(const FitInput& input,
 /// in `lost`. @return nullopt when nothing explains the corners
 std::optional<Fit> firstFit(const FitInput& input, int threads, std::vector<bool>* lost);
 
+/// Relative change of the cost at which a fit has converged to rounding, and one that is only
+/// compared with others: a thousandth of what noise makes of the cost. Rich structures on narrow
+/// fields have valleys in which no more than that can be gained in any number of steps.
+inline constexpr double kPolishTolerance = 1e-10;
+inline constexpr double kTrialTolerance = 1e-6;
+
 /// Fits `structure`, started from another fit of the same views.
-std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStructure& structure);
+std::optional<Fit> refit(const FitInput& input, const Fit& from, const LensStructure& structure,
+                         double tolerance = kPolishTolerance);
+
+/// Brings a fit of refit() to kPolishTolerance; left as it is where that fails.
+void polish(const FitInput& input, Fit& fit);
 
 /// Root mean square 2-D error over folds: each fold's views are predicted by lens and warp fitted
 /// to the others, with only their poses refitted by plain least squares over all corners. Folds
