@@ -7,6 +7,9 @@
 #include <tf2_ros/buffer.h>
 #include <tf2_ros/transform_listener.h>
 
+#include <atomic>
+
+#include "omnister/ros/callback_threads.h"
 #include "omnister/ros/conversions.h"
 #include "ros/ros_test.h"
 
@@ -55,6 +58,24 @@ TEST_P(RunningCamera, ReplaysImagesLensAndStage) {
 
 INSTANTIATE_TEST_SUITE_P(NodeAndNodelet, RunningCamera, testing::Values("alone", "loaded"),
                          [](const auto& info) { return std::string(info.param); });
+
+TEST(CallbackThreads, NoCallbackRunsOnceTheyAreStopped) {
+  for (int round = 0; round < 20; ++round) {
+    std::atomic<bool> runs{false};
+    CallbackThreads callbacks(2);
+    const ros::WallTimer timer =
+        callbacks.on(ros::NodeHandle())
+            .createWallTimer(ros::WallDuration(0.001), [&](const ros::WallTimerEvent&) {
+              runs = true;
+              ros::WallDuration(0.02).sleep();
+              runs = false;
+            });
+    callbacks.start();
+    ASSERT_TRUE(eventually([&] { return runs.load(); }));
+    callbacks.stop();
+    EXPECT_FALSE(runs);
+  }
+}
 
 TEST(CameraNodelet, IsLoadedAndUnloadedWhileItStreams) {
   const std::string name = "/come_and_go/camera";
