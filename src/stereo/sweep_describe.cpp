@@ -13,9 +13,21 @@ constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 
 }  // namespace
 
-void describeDisplaced(Level* level, int threads, const std::function<Scratch&()>& local) {
+void describeDisplaced(Level* level, int threads, const std::function<Scratch&()>& local,
+                       std::vector<std::uint16_t>* pairs) {
   constexpr int kStrip = 24;
   const Grid& grid = level->grid;
+  // Four pixels around a cell are then one word.
+  constexpr int kPad = PaddedImage::kPad;
+  const PaddedImage& image = level->displaced;
+  const int pairs_rows = image.height + 2 * kPad - 1;
+  pairs->resize(static_cast<std::size_t>(image.stride) * pairs_rows + 64);
+  parallelFor(0, (pairs_rows + kStrip - 1) / kStrip, threads, [&](std::size_t strip) {
+    const int begin = static_cast<int>(strip) * kStrip;
+    pairBlock(image, -kPad, begin - kPad, image.stride, std::min(kStrip, pairs_rows - begin),
+              Pairs::kDown, &(*pairs)[static_cast<std::size_t>(begin) * image.stride],
+              image.stride);
+  });
   for (const Band& band : grid.bands) {
     parallelFor(0, (band.rows + kStrip - 1) / kStrip, threads, [&](std::size_t strip) {
       Scratch& scratch = local();
@@ -37,7 +49,7 @@ void describeDisplaced(Level* level, int threads, const std::function<Scratch&()
       };
       for (int r = first; r < last; ++r) {
         if (band.runs[r] == 0) continue;
-        sampleRow(level->displaced, &grid.x[band.node[r]], &grid.y[band.node[r]],
+        sampleRow(pairs->data(), image.stride, &grid.x[band.node[r]], &grid.y[band.node[r]],
                   &grid.mask[(band.origin[r] + band.begin[r]) / 8], band.runs[r],
                   greyRow(r) + band.begin[r] - lo);
       }
@@ -63,10 +75,11 @@ void describeTile(const Level& level, bool finest, const Tile& tile, const Band&
     plane.assign(static_cast<std::size_t>(stride) * height + 64, 0);
   // Everything that windows of this tile can touch.
   constexpr int kAround = PaddedImage::kPad - kRadius;
-  const int wide_stride = stride + 2 * kAround;
-  scratch->wide.resize(static_cast<std::size_t>(wide_stride) * (height + 2 * kAround) + 64);
-  widenBlock(level.reference, rect.x - kRadius - kAround, rect.y - kRadius - kAround,
-             width + 2 * kAround, height + 2 * kAround, scratch->wide.data(), wide_stride);
+  const int pairs_stride = stride + 2 * kAround;
+  scratch->pairs.resize(static_cast<std::size_t>(pairs_stride) * (height + 2 * kAround) + 64);
+  pairBlock(level.reference, rect.x - kRadius - kAround, rect.y - kRadius - kAround,
+            width + 2 * kAround, height + 2 * kAround, Pairs::kAcross, scratch->pairs.data(),
+            pairs_stride);
   const bool narrow = !finest;
   const int block = narrow ? kBlock : 2 * kBlock;
   for (int y = 0; y < height; y += kBlock) {
@@ -100,7 +113,7 @@ void describeTile(const Level& level, bool finest, const Tile& tile, const Band&
       }
       std::uint8_t* out[kPlanes];
       for (int p = 0; p < kPlanes; ++p) out[p] = &scratch->reference[p][y * stride + x];
-      censusBlock(&scratch->wide[(y + kAround) * wide_stride + x + kAround], wide_stride, w, h,
+      censusBlock(&scratch->pairs[(y + kAround) * pairs_stride + x + kAround], pairs_stride, w, h,
                   offsets, narrow, out, stride);
     }
   }

@@ -65,9 +65,17 @@ void smoothRows(const cv::Mat& image, PaddedImage* out, int begin, int end);
 void halveRows(const PaddedImage& image, PaddedImage* out, int begin, int end);
 void fillBorderRows(PaddedImage* image);
 
+/// Grey values less 128, two in a word: that of the pixel in the low byte, in the high one that to
+/// its right or below it.
+enum class Pairs { kAcross, kDown };
+/// Pairs of the rectangle at (x0, y0), which may reach into the padding.
+void pairBlock(const PaddedImage& image, int x0, int y0, int width, int height, Pairs pairs,
+               std::uint16_t* out, int stride);
+
 /// Grey values of `runs` runs of a grid row: at least 1 where a cell sees the image, else 0.
-void sampleRow(const PaddedImage& image, const float* x, const float* y, const std::uint8_t* mask,
-               int runs, std::uint8_t* grey);
+/// @param pairs of pairBlock(), kDown, of the image with its padding
+void sampleRow(const std::uint16_t* pairs, int stride, const float* x, const float* y,
+               const std::uint8_t* mask, int runs, std::uint8_t* grey);
 
 /// Census of a grid row. @param rows the five rows around it, each at the column of `out`; two
 /// cells before and behind must be readable
@@ -77,13 +85,9 @@ void censusRow(const std::uint8_t* const rows[5], int count, std::uint8_t* const
 struct CensusOffsets {
   float dx[kBits], dy[kBits];
 };
-/// Grey values times 128 of the rectangle at (x0, y0), which may reach into the padding.
-void widenBlock(const PaddedImage& image, int x0, int y0, int width, int height, std::int16_t* out,
-                int stride);
-
 /// Census in the local epipolar frame. Columns are done 32 (or 16 for `narrow`) at a time: that
-/// much room is needed in `out`. @param grey of widenBlock(), at the block's first pixel
-void censusBlock(const std::int16_t* grey, int grey_stride, int width, int height,
+/// much room is needed in `out`. @param pairs of pairBlock(), kAcross, at the block's first pixel
+void censusBlock(const std::uint16_t* pairs, int pairs_stride, int width, int height,
                  const CensusOffsets& offsets, bool narrow, std::uint8_t* const out[kPlanes],
                  int stride);
 

@@ -43,7 +43,7 @@ struct Scratch {
   std::vector<std::int32_t> base;
   std::vector<float> residual, residual_sums, residual_mean;
   MapView view;
-  std::vector<std::int16_t> wide;
+  std::vector<std::uint16_t> pairs;
   std::vector<std::uint8_t> reference[kPlanes], costs, grey;
   std::vector<std::uint16_t> cost, before, after;
   std::vector<std::int16_t> index;
@@ -61,7 +61,9 @@ struct Scratch {
 
 /// Descriptors of the displaced image along its epipolar curves.
 /// @param scratch gives that of the calling thread
-void describeDisplaced(Level* level, int threads, const std::function<Scratch&()>& scratch);
+/// @param pairs room to work in
+void describeDisplaced(Level* level, int threads, const std::function<Scratch&()>& scratch,
+                       std::vector<std::uint16_t>* pairs);
 
 /// Census of the tile's pixels and halo in the local epipolar frames, to Scratch::reference.
 /// @param finest whether the level is the one of full resolution

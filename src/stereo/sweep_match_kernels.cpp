@@ -75,7 +75,7 @@ void MatchLanes(const ChunkJob& job) {
     const std::size_t row = static_cast<std::size_t>(y) * stride;
     if (y + kAhead < height) {
       // Cells of rows to come: the processor does not see these leaps coming.
-      for (int x = 0; x < width; x += 32) {
+      for (int x = 0; x < width; x += 8) {
         const std::ptrdiff_t base = bases[row + static_cast<std::size_t>(kAhead) * stride + x];
         hwy::Prefetch(cells0 + base);
         hwy::Prefetch(cells1 + base);

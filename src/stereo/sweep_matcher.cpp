@@ -58,8 +58,13 @@ class Stopwatch {
 
 /// Whether all of an image is of one grey level, give or take one.
 bool isBlank(const cv::Mat& image) {
-  double least = 0, most = 0;
-  cv::minMaxLoc(image, &least, &most);
+  double least = 255, most = 0;
+  for (int y = 0; y < image.rows && most - least <= 2; ++y) {
+    double low = 0, high = 0;
+    cv::minMaxLoc(image.row(y), &low, &high);
+    least = std::min(least, low);
+    most = std::max(most, high);
+  }
   return most - least <= 2;
 }
 
@@ -135,8 +140,8 @@ class SweepMatcher : public SweepPair {
     makePyramid(displaced.front(), &Level::displaced);
     watch.lap("prefilter");
     for (Level& level : levels_)
-      describeDisplaced(&level, options_.threads,
-                        [this]() -> Scratch& { return scratch_->local(); });
+      describeDisplaced(
+          &level, options_.threads, [this]() -> Scratch& { return scratch_->local(); }, &pairs_);
     watch.lap("describe");
     for (std::size_t l = levels_.size(); l-- > 0;) {
       matchLevel(l);
@@ -176,6 +181,7 @@ class SweepMatcher : public SweepPair {
       planes_[i] = other->planes_[i];
       other->planes_[i].release();
     }
+    pairs_ = std::move(other->pairs_);
     std::swap(scratch_, other->scratch_);
   }
 
@@ -646,10 +652,11 @@ class SweepMatcher : public SweepPair {
   std::vector<Level> levels_;
   std::unique_ptr<tbb::enumerable_thread_specific<Scratch>> scratch_ =
       std::make_unique<tbb::enumerable_thread_specific<Scratch>>();
-  cv::Mat cost_, steep_, claim_;  ///< of the finest level
-  cv::Mat planes_[3];             ///< of the last result
-  std::size_t field_ = 0;         ///< pixels with a ray
-  float finest_step_ = 0;         ///< least hypothesis step of any band
+  std::vector<std::uint16_t> pairs_;  ///< of the displaced image that is described
+  cv::Mat cost_, steep_, claim_;      ///< of the finest level
+  cv::Mat planes_[3];                 ///< of the last result
+  std::size_t field_ = 0;             ///< pixels with a ray
+  float finest_step_ = 0;             ///< least hypothesis step of any band
   // Claims on spots of the displaced image, kept on an equal-area map of (phi, theta').
   cv::Size claim_size_;
   float claim_x_ = 0, claim_y_offset_ = 0;

@@ -336,7 +336,11 @@ TEST_P(EverySet, SamplesBetweenPixels) {
     y[n] = 1 + static_cast<float>(random() % 3700) / 100;
     if (n < kRuns) mask[n] = n % 5 == 0 ? 0 : n % 7 == 0 ? 0x5A : 0xFF;
   }
-  sampleRow(padded, x.data(), y.data(), mask.data(), kRuns, grey.data());
+  constexpr int kPad = PaddedImage::kPad;
+  std::vector<std::uint16_t> pairs(padded.stride * (image.rows + 2 * kPad) + 64);
+  pairBlock(padded, -kPad, -kPad, padded.stride, image.rows + 2 * kPad - 1, Pairs::kDown,
+            pairs.data(), padded.stride);
+  sampleRow(pairs.data(), padded.stride, x.data(), y.data(), mask.data(), kRuns, grey.data());
   for (int n = 0; n < kRuns; ++n) {
     for (int i = 0; i < 8; ++i) {
       if (!(mask[n] >> i & 1)) {
