@@ -2,6 +2,7 @@
 #include <hwy/cache_control.h>
 
 #include <algorithm>
+#include <cstring>
 
 #include "sweep_geometry.h"
 #include "sweep_kernels.h"
@@ -40,13 +41,25 @@ HWY_INLINE std::uint16_t LeastLane(D d, V v) {
 #endif
 }
 
+/// A vector of two halves that lie apart. @param d of more than one lane
+template <class D>
+HWY_INLINE hn::Vec<D> LoadHalves(D d, const std::uint8_t* low, const std::uint8_t* high) {
+#if HWY_TARGET == HWY_SCALAR
+  static_cast<void>(high);
+  return hn::LoadU(d, low);
+#else
+  const hn::Half<D> half;
+  return hn::Combine(d, hn::LoadU(half, high), hn::LoadU(half, low));
+#endif
+}
+
 template <int kLanes, bool kFirst>
 void MatchLanes(const ChunkJob& job) {
   constexpr int kRowWidth = 128;
   constexpr int kAhead = 3;  // rows
   const int width = job.width, height = job.height, stride = job.stride;
   const int tile_width = width - 2 * kRadius;
-  const std::size_t line = static_cast<std::size_t>(width) * kLanes;
+  const std::size_t line = static_cast<std::size_t>(width + width % 2) * kLanes;
   job.scratch->assign(line * (kWindow + 1) + 256, 0);
   std::uint8_t* HWY_RESTRICT sums = job.scratch->data();
   std::uint8_t* const ring = sums + line;
@@ -59,7 +72,13 @@ void MatchLanes(const ChunkJob& job) {
   const std::uint8_t* HWY_RESTRICT cells1 = job.cells[1] + job.first;
   const std::uint8_t* HWY_RESTRICT cells2 = job.cells[2] + job.first;
 
-  const hn::CappedTag<std::uint8_t, kLanes> d8;
+  // Narrow chunks of two pixels share a vector where there is room.
+  constexpr int kPixels =
+      kLanes == 16 && hn::MaxLanes(hn::CappedTag<std::uint8_t, 32>()) == 32 ? 2 : 1;
+  HWY_ALIGN static constexpr std::uint8_t kTurn[32] = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
+                                                       0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1,
+                                                       1, 1, 1, 1, 1, 1, 1, 1, 1, 1};
+  const hn::CappedTag<std::uint8_t, kLanes * kPixels> d8;
   const hn::CappedTag<std::uint16_t, kLanes> d16;
   const hn::Rebind<std::uint8_t, decltype(d16)> d8h;
   constexpr std::size_t n8 = hn::MaxLanes(decltype(d8)());
@@ -82,21 +101,41 @@ void MatchLanes(const ChunkJob& job) {
         hwy::Prefetch(cells2 + base);
       }
     }
-    for (int x = 0; x < width; ++x) {
-      const std::size_t pixel = row + x;
-      const std::ptrdiff_t base = bases[pixel];
-      for (std::size_t l = 0; l < kLanes; l += n8) {
-        const auto cost0 = hn::PopulationCount(
-            hn::Xor(hn::LoadU(d8, cells0 + base + l), hn::Set(d8, reference0[pixel])));
-        const auto cost1 = hn::PopulationCount(
-            hn::Xor(hn::LoadU(d8, cells1 + base + l), hn::Set(d8, reference1[pixel])));
-        const auto cost2 = hn::PopulationCount(
-            hn::Xor(hn::LoadU(d8, cells2 + base + l), hn::Set(d8, reference2[pixel])));
-        const auto cost = hn::Add(hn::Add(cost0, cost1), cost2);
-        const std::size_t at = static_cast<std::size_t>(x) * kLanes + l;
-        const auto sum = hn::LoadU(d8, sums + at);
-        hn::StoreU(hn::Add(sum, hn::Sub(cost, hn::LoadU(d8, old + at))), d8, sums + at);
-        hn::StoreU(cost, d8, old + at);
+    const auto enter = [&](auto d, std::size_t at, auto cost0, auto cost1, auto cost2) {
+      const auto cost = hn::Add(hn::Add(cost0, cost1), cost2);
+      const auto sum = hn::LoadU(d, sums + at);
+      hn::StoreU(hn::Add(sum, hn::Sub(cost, hn::LoadU(d, old + at))), d, sums + at);
+      hn::StoreU(cost, d, old + at);
+    };
+    if constexpr (kPixels == 2) {
+      const auto turn = hn::Load(d8, kTurn);
+      for (int x = 0; x < width; x += 2) {
+        const std::size_t pixel = row + x;
+        const std::ptrdiff_t base = bases[pixel];
+        const std::ptrdiff_t next = bases[pixel + (x + 1 < width ? 1 : 0)];
+        const auto cost = [&](const std::uint8_t* cells, const std::uint8_t* reference) {
+          std::uint16_t two;
+          std::memcpy(&two, reference + pixel, 2);
+          const auto own = hn::TableLookupBytes(
+              hn::BitCast(d8, hn::Set(hn::Repartition<std::uint16_t, decltype(d8)>(), two)), turn);
+          const auto other = LoadHalves(d8, cells + base, cells + next);
+          return hn::PopulationCount(hn::Xor(other, own));
+        };
+        enter(d8, static_cast<std::size_t>(x) * kLanes, cost(cells0, reference0),
+              cost(cells1, reference1), cost(cells2, reference2));
+      }
+    } else {
+      for (int x = 0; x < width; ++x) {
+        const std::size_t pixel = row + x;
+        const std::ptrdiff_t base = bases[pixel];
+        for (std::size_t l = 0; l < kLanes; l += n8) {
+          const auto cost = [&](const std::uint8_t* cells, const std::uint8_t* reference) {
+            return hn::PopulationCount(
+                hn::Xor(hn::LoadU(d8, cells + base + l), hn::Set(d8, reference[pixel])));
+          };
+          enter(d8, static_cast<std::size_t>(x) * kLanes + l, cost(cells0, reference0),
+                cost(cells1, reference1), cost(cells2, reference2));
+        }
       }
     }
     if (y < kWindow - 1) continue;
@@ -142,6 +181,7 @@ void MatchChunk(const ChunkJob& job) {
   else
     MatchLanes<32, false>(job);
 }
+
 void MapCells(const MapCellsJob& job) {
   constexpr int kCell = 16, kBatch = 13;  // with three corners more, 16
   const hn::CappedTag<float, kCell> d;
