@@ -1,18 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <ros/ros.h>
-
 #include "omnister/ros/snapshot_server.h"
+#include "run_node.h"
 
 int main(int argc, char** argv) {
-  ros::init(argc, argv, "snapshot");
-  // Without any handle ROS ends, and with it its log: the reason why would not be told.
-  const ros::NodeHandle keep;
-  try {
-    omnister::SnapshotServer snapshot{ros::NodeHandle(), ros::NodeHandle("~")};
-    ros::spin();
-  } catch (const std::exception& error) {
-    ROS_FATAL("%s", error.what());
-    return 1;
-  }
-  return 0;
+  return omnister::runServer<omnister::SnapshotServer>(argc, argv, "snapshot");
 }

@@ -1,26 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <nodelet/nodelet.h>
-
-#include <memory>
 #include <pluginlib/class_list_macros.hpp>
 
 #include "omnister/ros/stereo_pipeline.h"
+#include "server_nodelet.h"
 
 namespace omnister {
 
-class StereoNodelet : public nodelet::Nodelet {
- private:
-  void onInit() override {
-    try {
-      stereo_ = std::make_unique<StereoPipeline>(getMTNodeHandle(), getMTPrivateNodeHandle());
-    } catch (const std::exception& error) {
-      NODELET_FATAL("%s", error.what());
-      throw;
-    }
-  }
-
-  std::unique_ptr<StereoPipeline> stereo_;
-};
+class StereoNodelet : public ServerNodelet<StereoPipeline> {};
 
 }  // namespace omnister
 

@@ -1,18 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <ros/ros.h>
-
 #include "omnister/ros/view_server.h"
+#include "run_node.h"
 
 int main(int argc, char** argv) {
-  ros::init(argc, argv, "view");
-  // Without any handle ROS ends, and with it its log: the reason why would not be told.
-  const ros::NodeHandle keep;
-  try {
-    omnister::ViewServer view{ros::NodeHandle(), ros::NodeHandle("~")};
-    ros::spin();
-  } catch (const std::exception& error) {
-    ROS_FATAL("%s", error.what());
-    return 1;
-  }
-  return 0;
+  return omnister::runServer<omnister::ViewServer>(argc, argv, "view");
 }

@@ -87,31 +87,33 @@ const char* take(const char* in, T& value) {
   return in + sizeof value;
 }
 
-void putPlyRow(const Cloud& cloud, int row, char* out) {
+// A row of points: place, colour as `put_color` writes it, sigma and score.
+template <typename PutColor>
+void putRow(const Cloud& cloud, int row, char* out, const PutColor& put_color) {
   const auto* xyz = cloud.xyz.ptr<cv::Vec3f>(row);
   const auto* bgr = cloud.bgr.ptr<cv::Vec3b>(row);
   const auto* sigma = cloud.sigma.ptr<float>(row);
   const auto* score = cloud.score.ptr<float>(row);
   for (int u = 0; u < cloud.xyz.cols; ++u) {
     for (int i = 0; i < 3; ++i) out = put(out, xyz[u][i]);
-    for (int i = 2; i >= 0; --i) out = put(out, bgr[u][i]);
+    out = put_color(out, bgr[u]);
     out = put(out, sigma[u]);
     out = put(out, score[u]);
   }
 }
 
+void putPlyRow(const Cloud& cloud, int row, char* out) {
+  putRow(cloud, row, out, [](char* at, const cv::Vec3b& bgr) {
+    for (int i = 2; i >= 0; --i) at = put(at, bgr[i]);
+    return at;
+  });
+}
+
 void putPcdRow(const Cloud& cloud, int row, char* out) {
-  const auto* xyz = cloud.xyz.ptr<cv::Vec3f>(row);
-  const auto* bgr = cloud.bgr.ptr<cv::Vec3b>(row);
-  const auto* sigma = cloud.sigma.ptr<float>(row);
-  const auto* score = cloud.score.ptr<float>(row);
-  for (int u = 0; u < cloud.xyz.cols; ++u) {
-    for (int i = 0; i < 3; ++i) out = put(out, xyz[u][i]);
-    // PCL packs the colour into the bits of one float.
-    out = put(out, static_cast<std::uint32_t>(bgr[u][2] << 16 | bgr[u][1] << 8 | bgr[u][0]));
-    out = put(out, sigma[u]);
-    out = put(out, score[u]);
-  }
+  // PCL packs the colour into the bits of one float.
+  putRow(cloud, row, out, [](char* at, const cv::Vec3b& bgr) {
+    return put(at, static_cast<std::uint32_t>(bgr[2] << 16 | bgr[1] << 8 | bgr[0]));
+  });
 }
 
 // Lines of the header of a PLY, with messages that name them.

@@ -15,6 +15,7 @@
 #include "omnister/common/numbers.h"
 #include "omnister/common/parallel.h"
 #include "omnister/common/pose.h"
+#include "temporary_folder.h"
 
 namespace omnister {
 namespace {
@@ -23,16 +24,11 @@ namespace fs = std::filesystem;
 
 class FileIo : public ::testing::Test {
  protected:
-  void SetUp() override {
-    std::string name = (fs::temp_directory_path() / "omnister-XXXXXX").string();
-    ASSERT_NE(::mkdtemp(name.data()), nullptr);
-    folder_ = name;
-  }
-  void TearDown() override { fs::remove_all(folder_); }
   std::size_t entries() const {
     return std::distance(fs::directory_iterator(folder_), fs::directory_iterator());
   }
-  fs::path folder_;
+  const test::TemporaryFolder temporary_;
+  const fs::path folder_ = temporary_.path();
 };
 
 TEST(Printable, EscapesControlCharactersAndBrokenUtf8) {

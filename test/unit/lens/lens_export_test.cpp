@@ -14,19 +14,18 @@
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_import.h"
 #include "omnister/lens/lens_models.h"
+#include "unit/lens/projection_residual.h"
 
 namespace omnister {
 namespace {
 
 using Eigen::Vector2d;
 using Eigen::Vector3d;
+using test::direction;
+using test::Residual;
 using ::testing::HasSubstr;
 
 constexpr double kPi = 3.14159265358979323846;
-
-Vector3d direction(double theta, double phi) {
-  return {std::sin(theta) * std::cos(phi), std::sin(theta) * std::sin(phi), std::cos(theta)};
-}
 
 struct Named {
   std::string name;
@@ -67,31 +66,13 @@ std::vector<Named> lenses() {
   return out;
 }
 
-struct Residual {
-  double rms = 0.0;
-  double max = 0.0;
-};
-
 // On a grid that the export does not know.
 template <typename Project>
 Residual residual(const LensModel& lens, double max_theta, const Project& project) {
-  Residual out;
-  int count = 0;
-  for (int i = 0; i <= 120; ++i) {
-    for (int j = 0; j < 45; ++j) {
-      const Vector3d n = direction(max_theta * (1.0 - 1e-9) * i / 120, 0.1 + j * 2.0 * kPi / 45);
-      const auto expected = lens.project(n);
-      const std::optional<Vector2d> pixel = project(n);
-      EXPECT_TRUE(expected && pixel) << n.transpose();
-      if (!expected || !pixel) return {1e9, 1e9};
-      const double error = (*pixel - *expected).norm();
-      out.rms += error * error;
-      out.max = std::max(out.max, error);
-      ++count;
-    }
-  }
-  out.rms = std::sqrt(out.rms / count);
-  return out;
+  std::vector<double> thetas;
+  for (int i = 0; i <= 120; ++i) thetas.push_back(max_theta * (1.0 - 1e-9) * i / 120);
+  return test::projectionResidual(
+      thetas, 45, 0.1, [&lens](const Vector3d& n) { return lens.project(n); }, project);
 }
 
 TEST(LensExport, ComesBackToTheStatedResidual) {

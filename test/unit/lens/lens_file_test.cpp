@@ -13,6 +13,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_models.h"
+#include "temporary_folder.h"
 
 namespace omnister {
 namespace {
@@ -99,13 +100,8 @@ LensFile sample(const LensStructure& structure, double max_theta = 1.7) {
 
 class LensFileOnDisk : public ::testing::Test {
  protected:
-  void SetUp() override {
-    std::string name = (fs::temp_directory_path() / "omnister-XXXXXX").string();
-    ASSERT_NE(::mkdtemp(name.data()), nullptr);
-    folder_ = name;
-  }
-  void TearDown() override { fs::remove_all(folder_); }
-  fs::path folder_;
+  const test::TemporaryFolder temporary_;
+  const fs::path folder_ = temporary_.path();
 };
 
 TEST(LensFile, ReadsTheDocumentedForm) {

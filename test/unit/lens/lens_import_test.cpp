@@ -16,19 +16,18 @@
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_file.h"
+#include "unit/lens/projection_residual.h"
 
 namespace omnister {
 namespace {
 
 using nlohmann::json;
+using test::direction;
+using test::Residual;
 using ::testing::HasSubstr;
 
 constexpr double kPi = 3.14159265358979323846;
 constexpr double kDegree = kPi / 180.0;
-
-Eigen::Vector3d direction(double theta, double phi) {
-  return {std::sin(theta) * std::cos(phi), std::sin(theta) * std::sin(phi), std::cos(theta)};
-}
 
 std::string list(std::initializer_list<double> values) {
   std::string out = "[";
@@ -103,32 +102,13 @@ double median(std::vector<double> values) {
   return n % 2 == 1 ? values[n / 2] : 0.5 * (values[n / 2 - 1] + values[n / 2]);
 }
 
-struct Residual {
-  double rms = 0.0;
-  double max = 0.0;
-};
-
 // On a grid of its own, up to 95 degrees or where the source turns back.
 Residual residual(const ForeignCamera& camera, const LensModel& lens, double limit) {
-  Residual out;
-  int count = 0;
-  for (int i = 0; i <= 190; ++i) {
-    const double theta = 0.5 * kDegree * i;
-    if (theta > limit) break;
-    for (int j = 0; j < 36; ++j) {
-      const Eigen::Vector3d n = direction(theta, (10.0 * j + 3.0) * kDegree);
-      const auto expected = camera.project(n);
-      const auto pixel = lens.project(n);
-      EXPECT_TRUE(expected && pixel) << theta / kDegree;
-      if (!expected || !pixel) return {1e9, 1e9};
-      const double error = (*pixel - *expected).norm();
-      out.rms += error * error;
-      out.max = std::max(out.max, error);
-      ++count;
-    }
-  }
-  out.rms = std::sqrt(out.rms / count);
-  return out;
+  std::vector<double> thetas;
+  for (int i = 0; i <= 190 && 0.5 * kDegree * i <= limit; ++i) thetas.push_back(0.5 * kDegree * i);
+  return test::projectionResidual(
+      thetas, 36, 3.0 * kDegree, [&](const Eigen::Vector3d& n) { return camera.project(n); },
+      [&](const Eigen::Vector3d& n) { return lens.project(n); });
 }
 
 TEST(ForeignLenses, BecomeSurfaces) {

@@ -17,6 +17,7 @@
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/stereo/plane_fit.h"
+#include "temporary_folder.h"
 
 namespace omnister {
 namespace {
@@ -27,13 +28,6 @@ constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 
 class CloudFile : public ::testing::Test {
  protected:
-  void SetUp() override {
-    std::string name = (fs::temp_directory_path() / "omnister-XXXXXX").string();
-    ASSERT_NE(::mkdtemp(name.data()), nullptr);
-    folder_ = name;
-  }
-  void TearDown() override { fs::remove_all(folder_); }
-
   // 5 x 3, every other pixel invalid.
   static Cloud sample() {
     Cloud cloud{cv::Mat(3, 5, CV_32FC3), cv::Mat(3, 5, CV_8UC3), cv::Mat(3, 5, CV_32FC1),
@@ -65,7 +59,8 @@ class CloudFile : public ::testing::Test {
     return std::distance(fs::directory_iterator(folder_), fs::directory_iterator());
   }
 
-  fs::path folder_;
+  const test::TemporaryFolder temporary_;
+  const fs::path folder_ = temporary_.path();
 };
 
 bool sameBytes(const cv::Mat& a, const cv::Mat& b) {

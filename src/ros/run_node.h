@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <ros/callback_queue.h>
+#include <ros/ros.h>
+
+#include <string>
+
+#include "omnister/common/error.h"
+
+namespace omnister {
+
+/// Serves callbacks until ROS goes down. @return false when `well` no longer holds
+template <typename Condition>
+bool spinWhile(const Condition& well) {
+  while (ros::ok() && well()) {
+    ros::getGlobalCallbackQueue()->callAvailable(ros::WallDuration(0.1));
+  }
+  return well();
+}
+
+/// main() of a node. `body` gets the handle of the node's namespace and the private one, and says
+/// whether all went well. @return the exit code: 1 also for what it throws, which the log tells
+template <typename Body>
+int runNode(int argc, char** argv, const std::string& name, const Body& body) {
+  ros::init(argc, argv, name);
+  // Without any handle ROS ends, and with it its log: the reason why would not be told.
+  const ros::NodeHandle keep;
+  try {
+    return body(ros::NodeHandle(), ros::NodeHandle("~")) ? 0 : 1;
+  } catch (const std::exception& error) {
+    ROS_FATAL_STREAM(printable(error.what(), 1000));
+    return 1;
+  }
+}
+
+/// The same for what is made of the two handles, and then serves until ROS goes down.
+template <typename Server>
+int runServer(int argc, char** argv, const std::string& name) {
+  return runNode(argc, argv, name, [](const ros::NodeHandle& node, const ros::NodeHandle& own) {
+    const Server server(node, own);
+    return spinWhile([] { return true; });
+  });
+}
+
+}  // namespace omnister
