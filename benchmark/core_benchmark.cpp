@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "measure.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/sim/renderer.h"
 #include "omnister/view/view.h"
@@ -69,33 +70,59 @@ void renderRoom(benchmark::State& state) {
   state.SetItemsProcessed(state.iterations() * kSize.area());
 }
 
-void viewFrame(benchmark::State& state) {
-  const LensPtr lens = equidistant180(kSize);
-  ViewGeometry geometry =
-      makeViewGeometry(Projection::kPinhole, {640, 480}, 80 * kDegree, viewRotation(0.5, 0.2, 0.1));
-  const View view(*lens, kSize, geometry);
-  cv::Mat image(kSize, CV_8UC3);
-  cv::randu(image, 0, 255);
-  for (auto _ : state) benchmark::DoNotOptimize(view.render(image).data);
-  state.SetItemsProcessed(state.iterations() * geometry.size.area());
-}
-
-/// What a view is measured against: OpenCV's remap with the same fixed maps.
-void remapFrame(benchmark::State& state) {
-  const LensPtr lens = equidistant180(kSize);
-  const ViewGeometry geometry =
-      makeViewGeometry(Projection::kPinhole, {640, 480}, 80 * kDegree, viewRotation(0.5, 0.2, 0.1));
-  cv::Mat map(geometry.size, CV_32FC2), fixed[2], image(kSize, CV_8UC3), view;
-  for (int y = 0; y < map.rows; ++y) {
-    for (int x = 0; x < map.cols; ++x) {
-      const Eigen::Vector2d p = *lens->project(*viewRay(geometry, Eigen::Vector2d(x, y)));
-      map.at<cv::Vec2f>(y, x) = {static_cast<float>(p.x()), static_cast<float>(p.y())};
+/// OpenCV's fixed maps of the same view.
+struct FixedMaps {
+  cv::Mat xy, fraction;
+  FixedMaps(const LensModel& lens, const ViewGeometry& geometry) {
+    cv::Mat map(geometry.size, CV_32FC2);
+    for (int y = 0; y < map.rows; ++y) {
+      for (int x = 0; x < map.cols; ++x) {
+        const auto pixel = lens.project(*viewRay(geometry, Eigen::Vector2d(x, y)));
+        map.at<cv::Vec2f>(y, x) =
+            pixel ? cv::Vec2f(static_cast<float>(pixel->x()), static_cast<float>(pixel->y()))
+                  : cv::Vec2f(-16.0f, -16.0f);
+      }
     }
+    cv::convertMaps(map, cv::noArray(), xy, fraction, CV_16SC2);
   }
-  cv::convertMaps(map, cv::noArray(), fixed[0], fixed[1], CV_16SC2);
+};
+
+/// A view beside cv::remap with the same fixed maps, frame about: `ratio` is remap's median time
+/// over the view's, so 1 or more where the view is as fast.
+void viewBesideRemap(benchmark::State& state, int type, double pan, bool anti_alias) {
+  const LensPtr lens = equidistant180(kSize);
+  const ViewGeometry geometry = makeViewGeometry(Projection::kPinhole, {640, 480}, 80 * kDegree,
+                                                 viewRotation(pan * kDegree, 0.2, 0.1));
+  const View view(*lens, kSize, geometry, anti_alias);
+  const FixedMaps maps(*lens, geometry);
+  cv::Mat image(kSize, type), ours, theirs;
   cv::randu(image, 0, 255);
-  for (auto _ : state) cv::remap(image, view, fixed[0], fixed[1], cv::INTER_LINEAR);
-  state.SetItemsProcessed(state.iterations() * geometry.size.area());
+  const int threads = cv::getNumThreads();
+  cv::setNumThreads(1);
+  std::vector<double> view_seconds, remap_seconds;
+  const auto timed = [](std::vector<double>& seconds, const auto& work) {
+    const double start = Instant::now().cpu;
+    work();
+    seconds.push_back(Instant::now().cpu - start);
+  };
+  const auto renderView = [&] { view.render(image, ours); };
+  const auto remap = [&] { cv::remap(image, theirs, maps.xy, maps.fraction, cv::INTER_LINEAR); };
+  bool ours_first = true;
+  for (auto _ : state) {
+    // The second finds the image in the cache: each is first as often.
+    if (ours_first) {
+      timed(view_seconds, renderView);
+      timed(remap_seconds, remap);
+    } else {
+      timed(remap_seconds, remap);
+      timed(view_seconds, renderView);
+    }
+    ours_first = !ours_first;
+  }
+  cv::setNumThreads(threads);
+  state.counters["view_ms"] = 1e3 * medianOf(view_seconds);
+  state.counters["remap_ms"] = 1e3 * medianOf(remap_seconds);
+  state.counters["ratio"] = medianOf(remap_seconds) / medianOf(view_seconds);
 }
 
 void sweepFrame(benchmark::State& state) {
@@ -139,8 +166,13 @@ BENCHMARK(renderRoom)
     ->Args({3, 0})
     ->Args({3, 1})
     ->Unit(benchmark::kMillisecond);
-BENCHMARK(viewFrame)->Unit(benchmark::kMillisecond);
-BENCHMARK(remapFrame)->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(viewBesideRemap, mono8, CV_8UC1, 28.0, true)->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(viewBesideRemap, bgr8, CV_8UC3, 28.0, true)->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(viewBesideRemap, bgr8_half_outside, CV_8UC3, 80.0, false)
+    ->Unit(benchmark::kMillisecond);
+// Smoothing, which remap leaves out, comes on top.
+BENCHMARK_CAPTURE(viewBesideRemap, bgr8_half_outside_smoothed, CV_8UC3, 80.0, true)
+    ->Unit(benchmark::kMillisecond);
 BENCHMARK(sweepFrame)
     ->ArgName("threads")
     ->Arg(1)

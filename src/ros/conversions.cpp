@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <boost/make_shared.hpp>
 #include <cmath>
-#include <cstring>
 #include <limits>
 #include <opencv2/imgproc.hpp>
 
@@ -66,29 +65,35 @@ Pose fromTransform(const geometry_msgs::Transform& transform, const std::string&
   return pose;
 }
 
-sensor_msgs::ImagePtr toImage(const cv::Mat& image, const std::string& encoding) {
-  if (image.empty() || image.dims != 2) throw Error("an image without pixels");
+sensor_msgs::ImagePtr newImage(cv::Size size, const std::string& encoding, cv::Mat* pixels) {
+  if (size.width < 1 || size.height < 1) throw Error("an image without pixels");
   int type = 0;
   try {
     type = cv_bridge::getCvType(encoding);
   } catch (const cv_bridge::Exception&) {
     throw Error("\"" + printable(encoding) + "\" is no image encoding");
   }
-  if (type != image.type()) {
+  auto message = boost::make_shared<sensor_msgs::Image>();
+  message->width = static_cast<std::uint32_t>(size.width);
+  message->height = static_cast<std::uint32_t>(size.height);
+  message->encoding = encoding;
+  message->is_bigendian = 0;
+  const std::size_t step = CV_ELEM_SIZE(type) * static_cast<std::size_t>(size.width);
+  message->step = static_cast<std::uint32_t>(step);
+  message->data.resize(step * static_cast<std::size_t>(size.height));
+  *pixels = cv::Mat(size, type, message->data.data(), step);
+  return message;
+}
+
+sensor_msgs::ImagePtr toImage(const cv::Mat& image, const std::string& encoding) {
+  if (image.dims != 2) throw Error("an image without pixels");
+  cv::Mat pixels;
+  sensor_msgs::ImagePtr message = newImage(image.size(), encoding, &pixels);
+  if (pixels.type() != image.type()) {
     throw Error("pixels of type " + cv::typeToString(image.type()) + " are not " +
                 printable(encoding));
   }
-  auto message = boost::make_shared<sensor_msgs::Image>();
-  message->width = static_cast<std::uint32_t>(image.cols);
-  message->height = static_cast<std::uint32_t>(image.rows);
-  message->encoding = encoding;
-  message->is_bigendian = 0;
-  const std::size_t step = image.elemSize() * static_cast<std::size_t>(image.cols);
-  message->step = static_cast<std::uint32_t>(step);
-  message->data.resize(step * static_cast<std::size_t>(image.rows));
-  for (int row = 0; row < image.rows; ++row) {
-    std::memcpy(message->data.data() + static_cast<std::size_t>(row) * step, image.ptr(row), step);
-  }
+  image.copyTo(pixels);
   return message;
 }
 

@@ -218,7 +218,10 @@ void ViewServer::onImage(const sensor_msgs::ImageConstPtr& image) {
                                             maps.anti_alias);
       std::string encoding;
       const cv::Mat pixels = picture(image, &encoding);
-      message = toImage(maps.image->render(pixels), encoding);
+      cv::Mat view;
+      message = newImage(maps.geometry.size, encoding, &view);
+      if (view.type() != pixels.type()) throw Error("pixels are not " + printable(encoding));
+      maps.image->render(pixels, view);
       message->header = image->header;
       message->header.frame_id = frameFor(image->header.frame_id);
       camera_info =

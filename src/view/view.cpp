@@ -4,6 +4,7 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <opencv2/imgproc.hpp>
 #include <string>
@@ -193,15 +194,15 @@ View::View(const LensModel& lens, cv::Size lens_size, const ViewGeometry& geomet
     Level made;
     cv::Mat share;
     if (l == 0) {
-      made.area = cv::Rect({0, 0}, size);
+      made.area = cv::boundingRect(mask_);
     } else {
       // Up to half an octave the finer level is sharp and free of aliasing enough.
       share = level - (l - 0.75f);
       share = cv::max(cv::min(share, 1.0), 0.0);
       made.area = cv::boundingRect(share > 0.0);
-      if (made.area.empty()) break;
-      made.share = share(made.area).clone();
+      if (!made.area.empty()) made.share = share(made.area).clone();
     }
+    if (made.area.empty()) break;
     // pyrDown() keeps the even pixels where they are.
     cv::Mat map = source(made.area).clone();
     if (l > 0) {
@@ -216,6 +217,14 @@ View::View(const LensModel& lens, cv::Size lens_size, const ViewGeometry& geomet
     cv::convertMaps(map, cv::noArray(), made.xy, made.fraction, CV_16SC2);
     levels_.push_back(made);
   }
+  for (int y = 0; y < size.height; ++y) {
+    const uchar* seen = mask_.ptr<uchar>(y);
+    for (int x = 0; x < size.width; ++x) {
+      if (seen[x] != 0) continue;
+      if (x == 0 || seen[x - 1] != 0) unseen_.push_back({y, x, x});
+      unseen_.back().end = x + 1;
+    }
+  }
 }
 
 Eigen::Matrix3d View::cameraMatrix() const {
@@ -227,6 +236,12 @@ Eigen::Matrix3d View::cameraMatrix() const {
 }
 
 cv::Mat View::render(const cv::Mat& image) const {
+  cv::Mat view;
+  render(image, view);
+  return view;
+}
+
+void View::render(const cv::Mat& image, cv::Mat& view) const {
   if (image.size() != lens_size_) {
     throw Error("image is " + std::to_string(image.cols) + "x" + std::to_string(image.rows) +
                 ", but the lens belongs to " + std::to_string(lens_size_.width) + "x" +
@@ -236,13 +251,14 @@ cv::Mat View::render(const cv::Mat& image) const {
   if ((depth != CV_8U && depth != CV_16U && depth != CV_32F) || image.channels() > 4) {
     throw Error("image has a type that views cannot show, expected 8 or 16 bits or float");
   }
-  cv::Mat view;
+  view.create(geometry_.size, image.type());
   cv::Mat reduced = image;
   for (std::size_t l = 0; l < levels_.size(); ++l) {
     const Level& level = levels_[l];
     if (l == 0) {
       // Half a pixel beyond the border still belongs to the border's pixels.
-      cv::remap(image, view, level.xy, level.fraction, cv::INTER_LINEAR, cv::BORDER_REPLICATE);
+      cv::Mat part = view(level.area);
+      cv::remap(image, part, level.xy, level.fraction, cv::INTER_LINEAR, cv::BORDER_REPLICATE);
       continue;
     }
     cv::Mat next;
@@ -259,8 +275,10 @@ cv::Mat View::render(const cv::Mat& image) const {
       mixRows<float>(coarse, level.share, fine);
     }
   }
-  view.setTo(cv::Scalar::all(0), mask_ == 0);
-  return view;
+  for (const Unseen& run : unseen_) {
+    std::memset(view.ptr(run.y, run.begin), 0,
+                view.elemSize() * static_cast<std::size_t>(run.end - run.begin));
+  }
 }
 
 DepthView::DepthView(const LensModel& lens, cv::Size lens_size, const ViewGeometry& geometry,

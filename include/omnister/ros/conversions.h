@@ -31,6 +31,10 @@ geometry_msgs::TransformStamped toTransformStamped(const Pose& pose, const ros::
 /// @throws InputError for numbers that are not finite or a zero quaternion
 Pose fromTransform(const geometry_msgs::Transform& transform, const std::string& source);
 
+/// An image to be drawn into: `pixels` is its data. The header is left to the caller.
+/// @throws Error for no size or an encoding that there is not
+sensor_msgs::ImagePtr newImage(cv::Size size, const std::string& encoding, cv::Mat* pixels);
+
 /// Copies the pixels. The header is left to the caller.
 /// @throws Error when the encoding does not belong to the type of the pixels
 sensor_msgs::ImagePtr toImage(const cv::Mat& image, const std::string& encoding);

@@ -79,8 +79,14 @@ class View {
   /// @param image of the lens' size; 8 or 16 bits or float, at most 4 channels
   /// @throws Error for another size or type
   cv::Mat render(const cv::Mat& image) const;
+  /// The same into a picture that is there already, if size and type are right; else a new one.
+  void render(const cv::Mat& image, cv::Mat& view) const;
 
  private:
+  /// Pixels of one row that the camera does not see.
+  struct Unseen {
+    int y, begin, end;
+  };
   /// One level of the image's pyramid: its maps, and where and how much it takes part.
   struct Level {
     cv::Rect area;     // of the view
@@ -91,6 +97,7 @@ class View {
   cv::Size lens_size_;
   ViewGeometry geometry_;
   cv::Mat mask_;
+  std::vector<Unseen> unseen_;
   std::vector<Level> levels_;
 };
 

@@ -182,6 +182,11 @@ TEST(View, MaskAndBlackOutsideTheField) {
   for (const int type : {CV_8UC1, CV_8UC3, CV_16UC1, CV_32FC1}) {
     const cv::Mat seen = view.render(cv::Mat(200, 200, type, cv::Scalar::all(100)));
     ASSERT_EQ(seen.type(), type);
+    cv::Mat reused(seen.size(), type, cv::Scalar::all(77));
+    const uchar* const data = reused.data;
+    view.render(cv::Mat(200, 200, type, cv::Scalar::all(100)), reused);
+    EXPECT_EQ(reused.data, data) << "drawn in place";
+    EXPECT_EQ(cv::norm(reused, seen, cv::NORM_INF), 0.0);
     cv::Mat channel, bytes;
     cv::extractChannel(seen, channel, 0);
     channel.convertTo(bytes, CV_8U);
