@@ -409,6 +409,14 @@ std::vector<Finding> diagnose(const DoctorFacts& facts) {
   }
   if (!findings.failed() && stereo.listened_to) cloud(facts, findings);
   for (const DoctorFacts::Images& images : facts.images) drops(facts, images, findings);
+  if (stereo.drift) {
+    findings.warning(
+        "calibration_drift",
+        "features lie " + number(stereo.drift_px, "%.2f") +
+            " px off their epipolar curves: lens or pose is no longer that of the rig",
+        "see which with `omnister evaluate board` and `omnister evaluate pair`, tighten "
+        "what is loose, and calibrate again: roslaunch omnister calibrate.launch");
+  }
   const double busy = count(stereo.counts, "busy");
   const double rate = facts.images.empty() ? 0.0 : facts.images.front().rate;
   // With a limit on the rate the matcher is idle in between, which is no news.

@@ -454,6 +454,14 @@ DoctorFacts gatherFacts(const DoctorOptions& options) {
       if (key == "baseline missed [m]") stereo.missed_baseline = value;
     }
     if (valid + rejected > 0.0) stereo.valid_fraction = valid / (valid + rejected);
+    const auto calibration = ears.statuses.find(withoutSlash(name) + ": calibration");
+    if (calibration != ears.statuses.end()) {
+      const Ears::Status& drift = calibration->second;
+      const auto verdict = drift.values.find("verdict");
+      const auto px = drift.last.find("drift [px]");
+      stereo.drift = verdict != drift.values.end() && verdict->second == "drift";
+      if (px != drift.last.end()) stereo.drift_px = px->second;
+    }
     if (options.passive) stereo.clouds = static_cast<int>(std::max(0.0, status.growth("clouds")));
   }
   for (std::size_t i = 0; i < facts.images.size(); ++i) {

@@ -132,6 +132,7 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
   result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
   result.preset = parameters.choice("preset", "custom", {"custom", "balanced", "accurate"});
+  result.drift = loadDriftParameters(parameters);
   result.epipolar_pixels = parameters.text("epipolar_pixels", "");
   parsePixels(result.epipolar_pixels, "~epipolar_pixels");
   StereoConfig config = toConfig(result);
@@ -161,6 +162,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       pairing_(parameters_.pairing),
       last_cloud_(ros::SteadyTime::now()),
       worker_(parameters_.matcher, parameters_.matching),
+      drift_(parameters_.drift),
       diagnostics_(node, private_node, private_node.getNamespace()) {
   const std::vector<std::string> prefixes =
       parameters_.rig ? std::vector<std::string>{"left/", "right/"} : std::vector<std::string>{""};
@@ -209,6 +211,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
   }
   diagnostics_.setHardwareID("none");
   diagnostics_.add("stereo", this, &StereoPipeline::diagnose);
+  diagnostics_.add("calibration", &drift_, &DriftDiagnostic::diagnose);
   // By the steady clock, so that it goes on while a recording pauses.
   diagnostics_timer_ = node_.createSteadyTimer(
       ros::WallDuration(1.0),
@@ -639,6 +642,7 @@ void StereoPipeline::process(const StereoSet& job) {
   }
   times.age = (ros::Time::now() - header.stamp).toSec();
   times_publisher_.publish(times);
+  drift_.look(job, prepared, result.range);
 
   std::lock_guard<std::mutex> lock(mutex_);
   ++clouds_;

@@ -265,6 +265,16 @@ TEST(Doctor, TellsThatTheMatcherCannotKeepUp) {
   EXPECT_THAT(findings.front().cause, testing::HasSubstr("1.7"));
 }
 
+TEST(Doctor, TellsOfACalibrationThatDrifted) {
+  DoctorFacts facts = healthy();
+  facts.stereo.drift = true;
+  facts.stereo.drift_px = 0.83;
+  const std::vector<Finding> findings = diagnose(facts);
+  ASSERT_THAT(findings, testing::SizeIs(1));
+  EXPECT_EQ(findings[0].code, "calibration_drift");
+  EXPECT_THAT(findings[0].cause, testing::HasSubstr("0.83 px"));
+}
+
 TEST(Doctor, EvidenceFromOutsideIsPrintedSafely) {
   DoctorFacts facts = healthy();
   noCloud(facts);

@@ -41,6 +41,8 @@ struct DoctorFacts {
     double valid_fraction = 1.0;             ///< of the last cloud
     std::map<std::string, double> rejected;  ///< pixels of the last cloud by test
     double seconds = 0.0;                    ///< of the last cloud
+    bool drift = false;     ///< features lie off their epipolar curves, beyond doubt
+    double drift_px = 0.0;  ///< so far
   } stereo;
 
   /// The image topic; in mode rig that of the left and of the right camera.

@@ -26,6 +26,7 @@
 
 #include "omnister/lens/lens_file.h"
 #include "omnister/ros/callback_threads.h"
+#include "omnister/ros/drift_diagnostic.h"
 #include "omnister/ros/frame_pairing.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
@@ -48,7 +49,8 @@ struct StereoParameters {
   MatcherOptions matching;  ///< with the mask
   std::string matcher = "sweep";
   std::string preset = "custom";  ///< of positions, hypotheses and matcher, see cfg/Stereo.cfg
-  std::string epipolar_pixels;    ///< of the overlay, see parsePixels(); empty: defaultPixels()
+  DriftParameters drift;
+  std::string epipolar_pixels;  ///< of the overlay, see parsePixels(); empty: defaultPixels()
 };
 
 /// @throws InputError naming key, value and range, or the mask file
@@ -151,6 +153,7 @@ class StereoPipeline {
   std::size_t worker_generation_ = 0;  ///< of live_ that worker_ was set up with
   std::thread thread_;
 
+  DriftDiagnostic drift_;
   diagnostic_updater::Updater diagnostics_;
   ros::SteadyTimer diagnostics_timer_;
   boost::recursive_mutex config_mutex_;
