@@ -4,13 +4,14 @@ set -euo pipefail
 
 usage() {
   cat <<'TXT'
-./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling [OPTION…]]
+./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling | camera [OPTION…]]
 
   parts      Google Benchmark: lenses, renderer, views, the sweep
   compare    the sweep beside OpenCV's matchers on the same rendered pair, at 1280x960 and 3060x2036,
              one thread and all: times as ratios, memory, density, errors
   accuracy   errors of the sweep by field angle on further scenes; phase bias; more than two positions
   scaling    cost by pixels, hypotheses, positions and threads, with a plot
+  camera     processor time of the camera driver beside a bare Aravis loop, on Debian's software camera
 
 Without a name: all of them. Options after a name go to it (`./run bench compare --help`). --quick: fewer
 runs and the small size only. Results go to DIR too (JSON, CSV, SVG). OMNISTER_SIMD=avx2 or scalar holds
@@ -33,6 +34,7 @@ if [ -n "$out" ]; then
   mkdir -p "$out"
   out=$(cd "$out" && pwd)
 fi
+here=$(cd "$(dirname "$0")" && pwd)
 part=${1:-all}
 [ $# -gt 0 ] && shift
 
@@ -51,17 +53,22 @@ compare() {
   fi
 }
 
+# 77: there is no camera to measure on.
+camera() { /usr/bin/python3 "$here/camera_cost.py" "$@" || [ $? -eq 77 ]; }
+
 case "$part" in
   all)
     parts
     compare
     stereo --suite accuracy
     stereo --suite scaling --runs "$([ -n "$quick" ] && echo 3 || echo 5)"
+    camera --rounds "$([ -n "$quick" ] && echo 1 || echo 5)"
     ;;
   parts) parts "$@" ;;
   compare) compare "$@" ;;
   accuracy) stereo --suite accuracy "$@" ;;
   scaling) stereo --suite scaling "$@" ;;
+  camera) camera "$@" ;;
   *)
     usage >&2
     exit 2

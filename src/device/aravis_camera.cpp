@@ -27,6 +27,8 @@ constexpr int kLeastSocketBuffer = 2 << 20, kMostSocketBuffer = 64 << 20;
 // On loopback packets are as large as the protocol allows.
 constexpr int kLoopbackPacket = 16000;
 constexpr seconds kTemperatureAgain(5);
+// Of so many frames' packets in the kernel's memory none gets lost while others have the processor.
+constexpr std::size_t kFramesThatWait = 2;
 
 /// The kernel's limit of a socket's receive buffer.
 long kernelSocketBuffer() {
@@ -73,8 +75,9 @@ class AravisCamera : public Camera {
                         " bytes");
     }
     payload_ = payload;
-    stream_.reset(
-        arv_camera_create_stream(on_.camera(), &AravisCamera::onStream, nullptr, failure.out()));
+    const bool hurry = static_cast<std::size_t>(socketBuffer()) < kFramesThatWait * payload_;
+    stream_.reset(arv_camera_create_stream(on_.camera(), hurry ? &AravisCamera::hurry : nullptr,
+                                           nullptr, failure.out()));
     on_.refuseIf(failure, "no stream can be opened");
     if (ARV_IS_GV_STREAM(stream_.get())) tuneGigeStream();
     for (int i = 0; i < settings_.buffers; ++i) pushNewBuffer();
@@ -146,12 +149,26 @@ class AravisCamera : public Camera {
   }
 
  private:
-  /// In the thread that takes packets from the kernel, which must not wait for others: what it
-  /// misses is lost. Without the right to, it stays as it is.
-  static void onStream(void* /*data*/, ArvStreamCallbackType type, ArvBuffer* /*buffer*/) {
+  /// In the thread that takes packets from the kernel, where the kernel does not keep them for
+  /// long: then it must not wait for others, which costs a wake-up a packet. Without the right to,
+  /// it stays as it is.
+  static void hurry(void* /*data*/, ArvStreamCallbackType type, ArvBuffer* /*buffer*/) {
     if (type != ARV_STREAM_CALLBACK_TYPE_INIT) return;
     constexpr int kAboveOthers = -10;
     setpriority(PRIO_PROCESS, static_cast<id_t>(syscall(SYS_gettid)), kAboveOthers);
+  }
+
+  /// Wanted of the kernel, in which packets wait for us [bytes].
+  int wantedSocketBuffer() const {
+    if (settings_.socket_buffer_bytes > 0) return settings_.socket_buffer_bytes;
+    return static_cast<int>(
+        std::clamp<long>(4L * static_cast<long>(payload_), kLeastSocketBuffer, kMostSocketBuffer));
+  }
+  /// As the kernel gives it.
+  int socketBuffer() const {
+    const long limit = kernelSocketBuffer();
+    const int wanted = wantedSocketBuffer();
+    return limit > 0 ? static_cast<int>(std::min<long>(limit, wanted)) : wanted;
   }
 
   void tuneGige() {
@@ -180,10 +197,7 @@ class AravisCamera : public Camera {
   }
 
   void tuneGigeStream() {
-    const long fitting =
-        std::clamp<long>(4L * static_cast<long>(payload_), kLeastSocketBuffer, kMostSocketBuffer);
-    const int bytes = settings_.socket_buffer_bytes > 0 ? settings_.socket_buffer_bytes
-                                                        : static_cast<int>(fitting);
+    const int bytes = wantedSocketBuffer();
     g_object_set(stream_.get(), "socket-buffer", ARV_GV_STREAM_SOCKET_BUFFER_FIXED,
                  "socket-buffer-size", static_cast<gint>(bytes), "packet-resend",
                  settings_.packet_resend ? ARV_GV_STREAM_PACKET_RESEND_ALWAYS
@@ -255,10 +269,12 @@ class AravisCamera : public Camera {
     Frame frame;
     frame.encoding = format->encoding;
     frame.stamp = clock_.stampOf(buffer);
-    frame.sequence = sequenceOf(arv_buffer_get_frame_id(buffer));
+    frame.number = arv_buffer_get_frame_id(buffer);
+    frame.sequence = sequenceOf(frame.number);
     frame.region = region_;
     const auto* memory = static_cast<const FrameMemoryPtr*>(arv_buffer_get_user_data(buffer));
-    if (format->direct() && memory && (*memory)->bytes.data() == data) {
+    const bool whole_samples = step % CV_ELEM_SIZE1(format->type) == 0;
+    if (format->direct() && whole_samples && memory && (*memory)->bytes.data() == data) {
       frame.memory = *memory;
       frame.image = cv::Mat(size, format->type, frame.memory->bytes.data(), step);
       pushNewBuffer();

@@ -123,7 +123,12 @@ cv::Mat unpack(const PixelFormat& format, const std::uint8_t* data, cv::Size siz
   auto* bytes = const_cast<std::uint8_t*>(data);  // cv::Mat knows no constant memory
   cv::Mat out;
   if (format.direct()) {
-    cv::Mat(size, format.type, bytes, step).copyTo(out);
+    // Row by row: a cv::Mat takes no step that cuts a sample in two.
+    out.create(size, format.type);
+    for (int y = 0; y < size.height; ++y) {
+      std::memcpy(out.ptr(y), data + static_cast<std::size_t>(y) * step,
+                  static_cast<std::size_t>(size.width) * out.elemSize());
+    }
     return out;
   }
   switch (format.packing) {

@@ -15,11 +15,10 @@
 #include <cstring>
 #include <filesystem>
 #include <fstream>
-#include <opencv2/imgcodecs.hpp>
-#include <opencv2/imgproc.hpp>
 #include <tuple>
 
 #include "omnister/common/numbers.h"
+#include "v4l2_format.h"
 
 namespace omnister::device {
 namespace {
@@ -31,41 +30,6 @@ using std::chrono::nanoseconds;
 
 constexpr std::size_t kMaxImageBytes = std::size_t{1} << 30;
 constexpr auto kCapture = V4L2_BUF_TYPE_VIDEO_CAPTURE;
-
-enum class Coding { kPlain, kYuyv, kUyvy, kNv12, kJpeg };
-
-struct Format {
-  std::uint32_t fourcc;
-  const char* encoding;
-  int type;  ///< of the frame
-  Coding coding;
-};
-constexpr Format kFormats[] = {
-    {V4L2_PIX_FMT_GREY, "mono8", CV_8UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_Y16, "mono16", CV_16UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SRGGB8, "bayer_rggb8", CV_8UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SGRBG8, "bayer_grbg8", CV_8UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SGBRG8, "bayer_gbrg8", CV_8UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SBGGR8, "bayer_bggr8", CV_8UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SRGGB16, "bayer_rggb16", CV_16UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SGRBG16, "bayer_grbg16", CV_16UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SGBRG16, "bayer_gbrg16", CV_16UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_SBGGR16, "bayer_bggr16", CV_16UC1, Coding::kPlain},
-    {V4L2_PIX_FMT_BGR24, "bgr8", CV_8UC3, Coding::kPlain},
-    {V4L2_PIX_FMT_RGB24, "rgb8", CV_8UC3, Coding::kPlain},
-    {V4L2_PIX_FMT_YUYV, "bgr8", CV_8UC3, Coding::kYuyv},
-    {V4L2_PIX_FMT_UYVY, "bgr8", CV_8UC3, Coding::kUyvy},
-    {V4L2_PIX_FMT_NV12, "bgr8", CV_8UC3, Coding::kNv12},
-    {V4L2_PIX_FMT_MJPEG, "bgr8", CV_8UC3, Coding::kJpeg},
-    {V4L2_PIX_FMT_JPEG, "bgr8", CV_8UC3, Coding::kJpeg},
-};
-
-const Format* findFormat(std::uint32_t fourcc) {
-  for (const Format& format : kFormats) {
-    if (format.fourcc == fourcc) return &format;
-  }
-  return nullptr;
-}
 
 std::string fourccText(std::uint32_t code) {
   std::string text;
@@ -389,9 +353,9 @@ class V4l2Camera : public Camera {
                           printable(settings_.pixel_format) + "\"; it offers " + names);
       }
       pixels.pixelformat = *code;
-    } else if (!findFormat(pixels.pixelformat)) {
+    } else if (!findV4l2Format(pixels.pixelformat)) {
       const auto known = std::find_if(offered.begin(), offered.end(),
-                                      [](std::uint32_t code) { return findFormat(code); });
+                                      [](std::uint32_t code) { return findV4l2Format(code); });
       if (known != offered.end()) pixels.pixelformat = *known;
     }
     const std::uint32_t wanted = pixels.pixelformat;
@@ -412,18 +376,18 @@ class V4l2Camera : public Camera {
                          fourccText(given_.pixelformat) + " " + std::to_string(got.width) + "x" +
                          std::to_string(got.height));
     }
-    format_ = findFormat(given_.pixelformat);
+    format_ = findV4l2Format(given_.pixelformat);
     if (!format_) {
       throw CameraError(device_.path + " streams in " + fourccText(given_.pixelformat) +
                         ", for which there is no encoding; it offers " + names);
     }
     // Drivers may leave the step out.
-    const std::size_t pixel = format_->coding == Coding::kPlain
+    const std::size_t pixel = format_->coding == V4l2Coding::kPlain
                                   ? static_cast<std::size_t>(CV_ELEM_SIZE(format_->type))
-                              : format_->coding == Coding::kNv12 ? 1
-                                                                 : 2;
+                              : format_->coding == V4l2Coding::kNv12 ? 1
+                                                                     : 2;
     step_ = std::max<std::size_t>(given_.bytesperline, pixel * given_.width);
-    if (format_->coding == Coding::kNv12 && (given_.width % 2 != 0 || given_.height % 2 != 0)) {
+    if (format_->coding == V4l2Coding::kNv12 && (given_.width % 2 != 0 || given_.height % 2 != 0)) {
       throw CameraError(device_.path + ": NV12 needs an even size");
     }
     if (given_.width == 0 || given_.height == 0 || step_ * given_.height > kMaxImageBytes) {
@@ -552,6 +516,10 @@ class V4l2Camera : public Camera {
     set(query.id, name, *number);
   }
 
+  cv::Size imageSize() const {
+    return {static_cast<int>(given_.width), static_cast<int>(given_.height)};
+  }
+
   std::optional<Frame> take(const v4l2_buffer& buffer) {
     if (buffer.index >= mappings_.size())
       throw CameraError(device_.path + " gives a frame nobody knows");
@@ -561,51 +529,13 @@ class V4l2Camera : public Camera {
     frame.sequence = sequenceOf(buffer.sequence);
     frame.stamp = stampOf(buffer);
     frame.encoding = format_->encoding;
-    if ((buffer.flags & V4L2_BUF_FLAG_ERROR) != 0 || !decode(mapping.data(), used, &frame)) {
+    if ((buffer.flags & V4L2_BUF_FLAG_ERROR) != 0 ||
+        !decodeV4l2(*format_, mapping.data(), used, imageSize(), step_, pool_.get(), &frame)) {
       ++statistics_.incomplete;
       return std::nullopt;
     }
     ++statistics_.complete;
     return frame;
-  }
-
-  /// @return false for what is no whole frame
-  bool decode(const std::uint8_t* data, std::size_t bytes, Frame* frame) const {
-    const cv::Size size(static_cast<int>(given_.width), static_cast<int>(given_.height));
-    auto* pixels = const_cast<std::uint8_t*>(data);  // cv::Mat knows no constant memory
-    const auto rows = static_cast<std::size_t>(size.height);
-    switch (format_->coding) {
-      case Coding::kPlain: {
-        if (bytes < step_ * rows) return false;
-        frame->memory = pool_->take(step_ * rows);
-        std::memcpy(frame->memory->bytes.data(), data, step_ * rows);
-        frame->image = cv::Mat(size, format_->type, frame->memory->bytes.data(), step_);
-        return true;
-      }
-      case Coding::kYuyv:
-        if (bytes < step_ * rows) return false;
-        cv::cvtColor(cv::Mat(size, CV_8UC2, pixels, step_), frame->image, cv::COLOR_YUV2BGR_YUYV);
-        return true;
-      case Coding::kUyvy:
-        if (bytes < step_ * rows) return false;
-        cv::cvtColor(cv::Mat(size, CV_8UC2, pixels, step_), frame->image, cv::COLOR_YUV2BGR_UYVY);
-        return true;
-      case Coding::kNv12:
-        if (bytes < step_ * rows * 3 / 2) return false;
-        cv::cvtColor(cv::Mat(size.height * 3 / 2, size.width, CV_8UC1, pixels, step_), frame->image,
-                     cv::COLOR_YUV2BGR_NV12);
-        return true;
-      case Coding::kJpeg:
-        if (bytes < 4) return false;
-        try {
-          frame->image = cv::imdecode(cv::Mat(1, static_cast<int>(bytes), CV_8UC1, pixels),
-                                      cv::IMREAD_COLOR | cv::IMREAD_IGNORE_ORIENTATION);
-        } catch (const cv::Exception&) {
-          return false;
-        }
-        return frame->image.size() == size;
-    }
-    return false;
   }
 
   std::uint64_t sequenceOf(std::uint32_t number) {
@@ -639,7 +569,7 @@ class V4l2Camera : public Camera {
   const std::shared_ptr<FramePool> pool_;
   std::vector<std::string> remarks_, details_;
   std::vector<Mapping> mappings_;
-  const Format* format_ = nullptr;
+  const V4l2Format* format_ = nullptr;
   v4l2_pix_format given_{};
   std::size_t step_ = 0;
   double exposure_us_ = 0.0;

@@ -9,6 +9,7 @@
 #include <iomanip>
 #include <sstream>
 
+#include "omnister/lens/lens_part.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/parameters.h"
 
@@ -20,6 +21,7 @@ constexpr std::chrono::milliseconds kGrabTimeout(200);
 // An unplugged camera is told of once, and again now and then.
 constexpr std::chrono::seconds kRepeatProblem(30);
 constexpr std::chrono::seconds kPollStatistics(1);
+constexpr std::chrono::milliseconds kLookForListeners(50), kLookAfterDevice(250);
 // A service waits so long for the device; what is asked for is done later all the same.
 constexpr std::chrono::seconds kDeviceAnswers(3);
 // The stage of a recording stands at its position this long around a settled frame [s], and no
@@ -178,9 +180,11 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
   trigger_ = node_.advertiseService("trigger", &CameraDriver::onTrigger, this);
-  timer_ = node_.createWallTimer(ros::WallDuration(0.1),
-                                 [this](const ros::WallTimerEvent&) { onTimer(); });
+  timer_ = node_.createWallTimer(
+      ros::WallDuration(std::chrono::duration<double>(kLookAfterDevice).count()),
+      [this](const ros::WallTimerEvent&) { onTimer(); });
   thread_ = std::thread(&CameraDriver::run, this);
+  pthread_setname_np(thread_.native_handle(), "camera");
   callbacks_.start();
 }
 
@@ -211,7 +215,14 @@ void CameraDriver::waitFor(double seconds) {
   }
 }
 
-bool CameraDriver::wanted() const { return images_.getNumSubscribers() > 0; }
+bool CameraDriver::wanted() {
+  // Asking goes through the publishers of every transport: not for each frame.
+  if (Steady::now() >= wanted_due_) {
+    wanted_ = images_.getNumSubscribers() > 0;
+    wanted_due_ = Steady::now() + kLookForListeners;
+  }
+  return wanted_;
+}
 
 void CameraDriver::run() {
   while (!stop_) {
@@ -302,7 +313,7 @@ void CameraDriver::stream() {
       setState("idle");
       ROS_DEBUG("nobody listens, streaming stops");
     }
-    waitFor(0.02);
+    waitFor(std::chrono::duration<double>(kLookForListeners).count());
     return;
   }
   if (!streaming_) {
@@ -519,10 +530,21 @@ void CameraDriver::countLost(const device::Frame& frame) {
   const std::lock_guard<std::mutex> lock(mutex_);
   ++frames_;
   lost_ += gap;
+  last_number_ = frame.number;
   problem_.clear();
 }
 
 void CameraDriver::publish(const device::Frame& frame) {
+  bool moved = false;
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    const auto same = [](const device::SensorRegion& a, const device::SensorRegion& b) {
+      return a.sensor == b.sensor && a.region == b.region && a.binning == b.binning;
+    };
+    moved = frame.region && (!region_ || !same(*region_, *frame.region));
+    if (moved) region_ = frame.region;
+  }
+  if (moved) publishLens();
   const sensor_msgs::CameraInfoPtr info = infoFor(frame);
   const sensor_msgs::ImagePtr image = toMessage(frame);
   image->header.stamp = toRosTime(frame.stamp);
@@ -631,16 +653,33 @@ void CameraDriver::setLens(LensFile file) {
   auto lens = std::make_shared<Lens>();
   lens->info = toCameraInfo(file);
   lens->file = std::move(file);
-  std_msgs::Header header;
-  header.stamp = ros::Time::now();
-  header.frame_id = parameters_.frame_id;
-  const LensModelMessage message = toLensModelMessage(lens->file, header);
-  lens->yaml = message.yaml;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     lens_ = std::move(lens);
   }
-  lens_publisher_.publish(message);
+  publishLens();
+}
+
+bool CameraDriver::lensIsOfMore() const {
+  return lens_ && region_ && !region_->whole() && lens_->file.image_size == region_->sensor;
+}
+
+void CameraDriver::publishLens() {
+  try {
+    std_msgs::Header header;
+    header.stamp = ros::Time::now();
+    header.frame_id = parameters_.frame_id;
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (!lens_) return;
+    const LensModelMessage message = toLensModelMessage(
+        lensIsOfMore() ? partOfLens(lens_->file, region_->region, region_->binning) : lens_->file,
+        header);
+    if (message.yaml == published_lens_) return;
+    published_lens_ = message.yaml;
+    lens_publisher_.publish(message);
+  } catch (const Error& e) {
+    ROS_ERROR_STREAM("lens_model: " << printable(e.what(), 1000));
+  }
 }
 
 void CameraDriver::onLens(const LensModelMessage::ConstPtr& message) {
@@ -648,7 +687,7 @@ void CameraDriver::onLens(const LensModelMessage::ConstPtr& message) {
     if (message->header.frame_id != parameters_.frame_id) return;
     {
       const std::lock_guard<std::mutex> lock(mutex_);
-      if (lens_ && lens_->yaml == message->yaml) return;
+      if (message->yaml == published_lens_) return;
     }
     // Published again by us, so that the latched messages of both agree.
     setLens(fromLensModelMessage(*message, "lens_model"));
@@ -701,6 +740,7 @@ void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status)
   status.add("link", printable(statistics_.link));
   status.add("frames published", frames_);
   status.add("frames lost", lost_);
+  status.add("number of the last frame", last_number_);
   status.add("rate [Hz]", rate);
   status.add("frames incomplete", statistics_.incomplete);
   status.add("frames without memory", statistics_.underruns);

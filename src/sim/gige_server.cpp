@@ -17,6 +17,7 @@
 #include <optional>
 #include <thread>
 
+#include "gige_wire.h"
 #include "omnister/common/numbers.h"
 
 namespace omnister::sim {
@@ -36,6 +37,10 @@ constexpr guint32 kTriggerMode = 0x8010, kTriggerSource = 0x8014, kTriggerSoftwa
 constexpr guint32 kGain = 0x8020, kBlackLevel = 0x8024, kTemperature = 0x8028;
 constexpr guint32 kPtpEnable = 0x802c, kPtpStatus = 0x8030;
 constexpr guint32 kLatch = 0x8034, kLatchValue = 0x8038;
+constexpr guint32 kChunkMode = 0x8040, kChunkSelector = 0x8044, kChunkEnable = 0x8050;
+// What is appended to an image, each with its identity and length behind it.
+enum Chunk : guint32 { kImageChunk = 0x0e00, kExposureChunk = 0x0e01, kTimestampChunk = 0x0e02 };
+constexpr int kChunkBytes = 8, kChunkTail = 8;
 
 constexpr ArvPixelFormat kMono8 = ARV_PIXEL_FORMAT_MONO_8, kMono16 = ARV_PIXEL_FORMAT_MONO_16,
                          kBayer = ARV_PIXEL_FORMAT_BAYER_RG_8, kRgb = ARV_PIXEL_FORMAT_RGB_8_PACKED,
@@ -45,8 +50,6 @@ constexpr std::size_t kMaxSerial = 15;
 constexpr int kMaxSide = 8192;
 // How often the server looks at what was written to its registers.
 constexpr milliseconds kTick(1);
-// A sent frame leaves on the next beat of the fake camera.
-constexpr double kBeatHz = 500.0;
 // The clock of the camera, while it runs freely, is not the host's.
 constexpr std::int64_t kClockAhead = 123456789000LL;
 
@@ -96,6 +99,19 @@ std::string choiceXml(const std::string& name, guint32 address, const char* acce
          registerXml(name + "Reg", address, access);
 }
 
+std::string booleanXml(const std::string& name) {
+  return "<Boolean Name=\"" + name + "\"><pValue>" + name +
+         "Reg</pValue><OnValue>1</OnValue><OffValue>0</OffValue></Boolean>\n";
+}
+
+/// What a frame tells of itself, eight bytes behind the image. @param kind IntReg or FloatReg
+std::string chunkXml(const std::string& name, const char* kind, const char* identity) {
+  return std::string("<") + kind + " Name=\"" + name + "\"><Address>0</Address><Length>" +
+         std::to_string(kChunkBytes) + "</Length><AccessMode>RO</AccessMode><pPort>" + name +
+         "Port</pPort><Endianess>BigEndian</Endianess></" + kind + ">\n<Port Name=\"" + name +
+         "Port\" NameSpace=\"Standard\"><ChunkID>" + identity + "</ChunkID></Port>\n";
+}
+
 std::string commandXml(const std::string& name, guint32 address, int value) {
   return "<Command Name=\"" + name + "\"><pValue>" + name + "Reg</pValue><CommandValue>" +
          std::to_string(value) + "</CommandValue></Command>\n" +
@@ -141,7 +157,12 @@ std::string description() {
                               "TimestampLatch",
                               "TimestampLatchValue",
                               "PtpEnable",
-                              "PtpStatus"}) {
+                              "PtpStatus",
+                              "ChunkModeActive",
+                              "ChunkSelector",
+                              "ChunkEnable",
+                              "ChunkExposureTime",
+                              "ChunkTimestamp"}) {
     xml += std::string("<pFeature>") + feature + "</pFeature>";
   }
   xml += "</Category>\n";
@@ -166,7 +187,9 @@ std::string description() {
   xml +=
       "<IntSwissKnife Name=\"PayloadSize\"><pVariable Name=\"W\">Width</pVariable>"
       "<pVariable Name=\"H\">Height</pVariable><pVariable Name=\"F\">PixelFormat</pVariable>"
-      "<Formula>W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8</Formula></IntSwissKnife>\n";
+      "<pVariable Name=\"C\">ChunkModeActiveReg</pVariable>"
+      "<Formula>W * H * ((F &gt;&gt; 16) &amp; 0xFF) / 8 + C * " +
+      std::to_string(2 * kChunkBytes + 3 * kChunkTail) + "</Formula></IntSwissKnife>\n";
   xml += choiceXml("AcquisitionMode", ARV_FAKE_CAMERA_REGISTER_ACQUISITION_MODE, "RW",
                    {{"Continuous", 1}});
   xml += commandXml("AcquisitionStart", ARV_FAKE_CAMERA_REGISTER_ACQUISITION, 1);
@@ -191,11 +214,17 @@ std::string description() {
   xml += commandXml("TriggerSoftware", kTriggerSoftware, 1);
   xml += commandXml("TimestampLatch", kLatch, 1);
   xml += registerXml("TimestampLatchValue", kLatchValue, "RO", 8);
-  xml +=
-      "<Boolean Name=\"PtpEnable\"><pValue>PtpEnableReg</pValue><OnValue>1</OnValue>"
-      "<OffValue>0</OffValue></Boolean>\n" +
-      registerXml("PtpEnableReg", kPtpEnable, "RW");
+  xml += booleanXml("PtpEnable") + registerXml("PtpEnableReg", kPtpEnable, "RW");
   xml += choiceXml("PtpStatus", kPtpStatus, "RO", {{"Disabled", 3}, {"Slave", 9}});
+  xml += booleanXml("ChunkModeActive") + registerXml("ChunkModeActiveReg", kChunkMode, "RW");
+  xml += choiceXml("ChunkSelector", kChunkSelector, "RW", {{"ExposureTime", 0}, {"Timestamp", 1}});
+  xml += booleanXml("ChunkEnable") + "<IntReg Name=\"ChunkEnableReg\"><Address>" +
+         number(kChunkEnable) +
+         "</Address><pIndex Offset=\"4\">ChunkSelectorReg</pIndex><Length>4</Length>"
+         "<AccessMode>RW</AccessMode><pPort>Device</pPort><Cachable>NoCache</Cachable>"
+         "<Sign>Unsigned</Sign><Endianess>BigEndian</Endianess></IntReg>\n";
+  xml += chunkXml("ChunkExposureTime", "FloatReg", "0e01");
+  xml += chunkXml("ChunkTimestamp", "IntReg", "0e02");
   xml += "<Integer Name=\"TLParamsLocked\"><Value>0</Value><Min>0</Min><Max>1</Max></Integer>\n";
   xml += "<Port Name=\"Device\" NameSpace=\"Standard\"></Port>\n</RegisterDescription>\n";
   return xml;
@@ -286,17 +315,11 @@ class GigeServer::Impl {
       : options_(options), draw_(std::move(draw)) {
     check(options_);
     const DescriptionFile file;
-    server_ = arv_gv_fake_camera_new_full(options_.interface.c_str(), options_.serial.c_str(),
-                                          file.path());
-    if (!arv_gv_fake_camera_is_running(server_)) {
-      g_object_unref(server_);
-      throw device::CameraError("no camera can listen on \"" + printable(options_.interface) +
-                                "\": there is no such interface, or another camera has port 3956");
-    }
-    camera_ = arv_gv_fake_camera_get_fake_camera(server_);
+    camera_.reset(arv_fake_camera_new_full(options_.serial.c_str(), file.path()));
     powerUp();
-    arv_fake_camera_set_fill_pattern(camera_, &Impl::fill, this);
-    setPacketLoss(options_.packet_loss);
+    wire_ = std::make_unique<GigeWire>(options_.interface, camera_.get(), options_.packet_resend,
+                                       [this] { serveRegisters(); });
+    wire_->setLoss(options_.packet_loss);
     thread_ = std::thread(&Impl::run, this);
   }
 
@@ -307,15 +330,14 @@ class GigeServer::Impl {
     }
     wake_.notify_all();
     thread_.join();
-    g_object_unref(server_);
   }
 
   const GigeServerOptions& options() const { return options_; }
-  void setPacketLoss(double share) {
-    g_object_set(server_, "gvsp-lost-ratio", std::clamp(share, 0.0, 1.0), nullptr);
+  GigeWire& wire() { return *wire_; }
+  void setExposure(double us) {
+    set(ARV_FAKE_CAMERA_REGISTER_EXPOSURE_TIME_US, static_cast<guint32>(std::lround(us)));
   }
   void pulseLine0() { line0_ = true; }
-  std::uint64_t framesSent() const { return sent_; }
   std::string problem() const {
     const std::lock_guard<std::mutex> lock(mutex_);
     return problem_;
@@ -326,7 +348,7 @@ class GigeServer::Impl {
     const auto name = [this](guint32 address, const char* text) {
       std::array<char, kNameBytes> padded{};
       std::strncpy(padded.data(), text, padded.size() - 1);
-      arv_fake_camera_write_memory(camera_, address, kNameBytes, padded.data());
+      arv_fake_camera_write_memory(camera_.get(), address, kNameBytes, padded.data());
     };
     name(kManufacturer, "OMNister");
     name(kModel, "Simulated");
@@ -342,24 +364,19 @@ class GigeServer::Impl {
     set(kFramePeriod, static_cast<guint32>(std::lround(1e6 / options_.frame_rate_hz)));
     set(kTemperature, 4100);
     set(kPtpStatus, 3);
-    // To Aravis' fake camera a frame is always triggered: by the thread that has drawn it.
-    set(ARV_FAKE_CAMERA_REGISTER_TRIGGER_MODE, 1);
-    set(ARV_FAKE_CAMERA_REGISTER_TRIGGER_SOURCE, 1);
-    arv_fake_camera_set_trigger_frequency(camera_, kBeatHz);
   }
 
   guint32 get(guint32 address) const {
     guint32 value = 0;
-    arv_fake_camera_read_register(camera_, address, &value);
+    arv_fake_camera_read_register(camera_.get(), address, &value);
     return value;
   }
   void set(guint32 address, guint32 value) {
-    arv_fake_camera_write_register(camera_, address, value);
+    arv_fake_camera_write_register(camera_.get(), address, value);
   }
 
   bool streaming() const {
-    return arv_fake_camera_get_acquisition_status(camera_) != 0 &&
-           arv_fake_camera_get_control_channel_privilege(camera_) != 0;
+    return get(ARV_FAKE_CAMERA_REGISTER_ACQUISITION) != 0 && wire_->controlled();
   }
 
   /// The camera's clock at a time of the host's.
@@ -368,6 +385,7 @@ class GigeServer::Impl {
     return static_cast<std::uint64_t>(get(kPtpEnable) != 0 ? host : host - power_up_ + kClockAhead);
   }
 
+  /// By the thread that serves clients.
   void serveRegisters() {
     if (get(kLatch) != 0) {
       set(kLatch, 0);
@@ -380,7 +398,6 @@ class GigeServer::Impl {
 
   /// One tick. @return false at the end
   bool rest() {
-    serveRegisters();
     std::unique_lock<std::mutex> lock(mutex_);
     return !wake_.wait_for(lock, kTick, [this] { return stop_; });
   }
@@ -399,7 +416,6 @@ class GigeServer::Impl {
     bool was_streaming = false;
     while (rest()) {
       if (!streaming()) {
-        set(ARV_FAKE_CAMERA_REGISTER_TRIGGER_SOFTWARE, 0);
         was_streaming = false;
         continue;
       }
@@ -409,7 +425,6 @@ class GigeServer::Impl {
         due = Steady::now();
         was_streaming = true;
       }
-      if (get(ARV_FAKE_CAMERA_REGISTER_TRIGGER_SOFTWARE) != 0) continue;  // not yet on its way
       if (get(kTriggerMode) != 0) {
         if (!triggered()) continue;
       } else {
@@ -440,62 +455,73 @@ class GigeServer::Impl {
           std::max(1, image.rows / std::max(1, static_cast<int>(get(
                                                    ARV_FAKE_CAMERA_REGISTER_BINNING_VERTICAL)))));
       if (binned != image.size()) cv::resize(image, image, binned, 0, 0, cv::INTER_AREA);
+      wire_->send(toWire(image, start, exposure));
       const std::lock_guard<std::mutex> lock(mutex_);
-      drawn_ = image;
-      drawn_at_ = start;
       problem_.clear();
     } catch (const std::exception& e) {
       const std::lock_guard<std::mutex> lock(mutex_);
       problem_ = e.what();
-      return;
     }
-    set(ARV_FAKE_CAMERA_REGISTER_TRIGGER_SOFTWARE, 1);
   }
 
-  /// Called by Aravis' thread for every frame that it sends.
-  static void fill(ArvBuffer* buffer, void* self, guint32 /*exposure*/, guint32 /*gain*/,
-                   ArvPixelFormat format) {
-    static_cast<Impl*>(self)->fill(buffer, format);
-  }
-
-  void fill(ArvBuffer* buffer, guint32 format) {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    // Aravis has made sure that the buffer holds this much.
-    const std::size_t bytes = arv_fake_camera_get_payload(camera_);
-    auto* data = const_cast<std::uint8_t*>(
-        static_cast<const std::uint8_t*>(arv_buffer_get_data(buffer, nullptr)));
-    const int width = static_cast<int>(get(ARV_FAKE_CAMERA_REGISTER_WIDTH));
-    const int height = static_cast<int>(get(ARV_FAKE_CAMERA_REGISTER_HEIGHT));
-    const cv::Rect wanted(static_cast<int>(get(ARV_FAKE_CAMERA_REGISTER_X_OFFSET)),
-                          static_cast<int>(get(ARV_FAKE_CAMERA_REGISTER_Y_OFFSET)), width, height);
-    const cv::Rect region = wanted & cv::Rect({0, 0}, drawn_.size());
-    std::memset(data, 0, bytes);
-    arv_buffer_set_timestamp(buffer, cameraClock(drawn_at_));
-    ++sent_;
-    if (region.empty()) return;
-    cv::Mat image = toPixelFormat(drawn_, format);
-    if (image.empty()) return;
-    image = image(region);
-    const std::size_t row = static_cast<std::size_t>(width) * image.elemSize();
-    if (row * static_cast<std::size_t>(height) > bytes) return;
-    for (int y = 0; y < image.rows; ++y) {
-      std::memcpy(data + static_cast<std::size_t>(y) * row, image.ptr(y),
-                  static_cast<std::size_t>(image.cols) * image.elemSize());
+  /// The region of the image that the registers name, in their pixel format.
+  WireFrame toWire(const cv::Mat& drawn, Stamp start, microseconds exposure) const {
+    WireFrame frame;
+    frame.timestamp = cameraClock(start);
+    frame.pixel_format = get(ARV_FAKE_CAMERA_REGISTER_PIXEL_FORMAT);
+    frame.width = get(ARV_FAKE_CAMERA_REGISTER_WIDTH);
+    frame.height = get(ARV_FAKE_CAMERA_REGISTER_HEIGHT);
+    frame.x = get(ARV_FAKE_CAMERA_REGISTER_X_OFFSET);
+    frame.y = get(ARV_FAKE_CAMERA_REGISTER_Y_OFFSET);
+    const cv::Mat image = toPixelFormat(drawn, frame.pixel_format);
+    if (image.empty()) throw Error("there is no such pixel format");
+    const std::size_t row = frame.width * image.elemSize();
+    frame.data.assign(row * frame.height, 0);
+    const cv::Rect wanted(static_cast<int>(frame.x), static_cast<int>(frame.y),
+                          static_cast<int>(frame.width), static_cast<int>(frame.height));
+    const cv::Mat part = image(wanted & cv::Rect({0, 0}, image.size()));
+    for (int y = 0; y < part.rows; ++y) {
+      std::memcpy(frame.data.data() + static_cast<std::size_t>(y) * row, part.ptr(y),
+                  static_cast<std::size_t>(part.cols) * part.elemSize());
     }
+    frame.chunks = get(kChunkMode) != 0;
+    if (!frame.chunks) return frame;
+    const auto append = [&frame](std::uint64_t value, int bytes) {
+      for (int i = bytes - 1; i >= 0; --i) {
+        frame.data.push_back(static_cast<std::uint8_t>(value >> 8 * i));
+      }
+    };
+    const auto close = [&append](Chunk chunk, std::size_t bytes) {
+      append(chunk, kChunkTail / 2);
+      append(bytes, kChunkTail / 2);
+    };
+    close(kImageChunk, frame.data.size());
+    if (get(kChunkEnable) != 0) {
+      const auto us = static_cast<double>(exposure.count());
+      std::uint64_t bits = 0;
+      std::memcpy(&bits, &us, sizeof bits);
+      append(bits, kChunkBytes);
+      close(kExposureChunk, kChunkBytes);
+    }
+    if (get(kChunkEnable + 4) != 0) {
+      append(frame.timestamp, kChunkBytes);
+      close(kTimestampChunk, kChunkBytes);
+    }
+    return frame;
   }
 
   const GigeServerOptions options_;
   const DrawFrame draw_;
   const std::int64_t power_up_ = device::now().time_since_epoch().count();
-  ArvGvFakeCamera* server_ = nullptr;
-  ArvFakeCamera* camera_ = nullptr;  // of the server
+  struct Unref {
+    void operator()(ArvFakeCamera* camera) const { g_object_unref(camera); }
+  };
+  std::unique_ptr<ArvFakeCamera, Unref> camera_;  // the registers
+  std::unique_ptr<GigeWire> wire_;
   std::atomic<bool> line0_{false};
-  std::atomic<std::uint64_t> sent_{0};
   mutable std::mutex mutex_;
   std::condition_variable wake_;
   bool stop_ = false;
-  cv::Mat drawn_;
-  Stamp drawn_at_{};
   std::string problem_;
   std::thread thread_;
 };
@@ -504,9 +530,11 @@ GigeServer::GigeServer(const GigeServerOptions& options, DrawFrame draw)
     : impl_(std::make_unique<Impl>(options, std::move(draw))) {}
 GigeServer::~GigeServer() = default;
 std::string GigeServer::device() const { return "aravis:" + impl_->options().serial; }
-void GigeServer::setPacketLoss(double share) { impl_->setPacketLoss(share); }
+void GigeServer::setPacketLoss(double share) { impl_->wire().setLoss(share); }
+void GigeServer::setExposure(double us) { impl_->setExposure(us); }
 void GigeServer::pulseLine0() { impl_->pulseLine0(); }
-std::uint64_t GigeServer::framesSent() const { return impl_->framesSent(); }
+std::uint64_t GigeServer::framesSent() const { return impl_->wire().framesSent(); }
+std::uint64_t GigeServer::packetsSentAgain() const { return impl_->wire().packetsSentAgain(); }
 std::string GigeServer::problem() const { return impl_->problem(); }
 
 }  // namespace omnister::sim

@@ -305,6 +305,7 @@ TEST_F(AravisCamera, EachTriggerIsOneFrame) {
 TEST_F(AravisCamera, LostPacketsNeverMakeAPartialImageAndCountersAddUp) {
   options_.frame_rate_hz = 200.0;
   options_.exposure_us = 100.0;
+  options_.packet_resend = false;
   serve();
   settings_.packet_size = 576;  // some twenty packets a frame
   // Frames wait for the missing packets of those before them.
@@ -346,6 +347,53 @@ TEST_F(AravisCamera, LostPacketsNeverMakeAPartialImageAndCountersAddUp) {
   }
 }
 
+TEST_F(AravisCamera, LostPacketsAreAskedForAgain) {
+  serve();
+  settings_.packet_size = 576;
+  settings_.buffers = 32;
+  const std::unique_ptr<Camera> camera = open();
+  camera->start();
+  ASSERT_TRUE(next(camera.get()));
+  server_->setPacketLoss(0.02);
+  // Some twenty packets a frame: a third of the frames would come torn.
+  constexpr int kFrames = 60;
+  std::uint64_t first = 0, last = 0;
+  for (int i = 0; i < kFrames; ++i) {
+    const std::optional<Frame> frame = next(camera.get());
+    ASSERT_TRUE(frame);
+    ASSERT_TRUE(equal(frame->image, scene_.image(frame->image.at<cv::Vec3b>(0, 0)[0])));
+    if (i == 0) first = frame->sequence;
+    last = frame->sequence;
+  }
+  const CameraStatistics statistics = camera->statistics();
+  EXPECT_GT(server_->packetsSentAgain(), 5u);
+  EXPECT_GT(statistics.resent_packets, 5u);
+  // Without asking again a frame in three would be missing; now only those whose packets were lost
+  // several times over, or whose every packet was.
+  EXPECT_LE(last - first, kFrames + 5u) << statistics.incomplete;
+}
+
+TEST_F(AravisCamera, ChunksTellTheExposureOfEveryFrame) {
+  serve();
+  settings_.ptp = true;
+  settings_.chunks = true;
+  const std::unique_ptr<Camera> camera = open();
+  EXPECT_THAT(camera->takeRemarks(), testing::IsEmpty());
+  EXPECT_THAT(camera->takeDetails(), testing::Not(testing::Contains(HasSubstr("chunk"))));
+  camera->start();
+  int changes = 0;
+  for (int i = 0; i < 30; ++i) {
+    const std::optional<Frame> frame = next(camera.get());
+    ASSERT_TRUE(frame);
+    const std::size_t index = frame->image.at<cv::Vec3b>(0, 0)[0];
+    ASSERT_TRUE(equal(frame->image, scene_.image(index)));
+    // The middle of an exposure whose length only the frame itself tells.
+    EXPECT_EQ(frame->stamp, scene_.stamps().at(index));
+    if (i % 5 == 4) server_->setExposure(2000.0 + 1000.0 * ++changes);
+  }
+  EXPECT_EQ(changes, 6);
+}
+
 TEST_F(AravisCamera, ACameraInOtherHandsIsBusy) {
   serve();
   const std::unique_ptr<Camera> camera = open();
@@ -356,6 +404,19 @@ TEST_F(AravisCamera, ACameraThatIsNotThereIsToldWithThoseThatAre) {
   serve();
   EXPECT_THAT(refusal("aravis:nobody"), testing::AllOf(HasSubstr("nobody"), HasSubstr("T-1")));
   EXPECT_THAT(refusal("aravis:127.0.0.7"), HasSubstr("127.0.0.7"));
+}
+
+TEST_F(AravisCamera, AnyAddressOfTheLoopbackWillDo) {
+  options_.interface = "127.0.0.9";
+  options_.serial = "T-9";
+  serve();
+  for (const char* device : {"aravis:127.0.0.9", "aravis:T-9"}) {
+    SCOPED_TRACE(device);
+    const std::unique_ptr<Camera> camera = open(device);
+    EXPECT_THAT(camera->statistics().link, HasSubstr("127.0.0.9"));
+    camera->start();
+    EXPECT_TRUE(next(camera.get()));
+  }
 }
 
 TEST_F(AravisCamera, AnUnnamedCameraIsTakenWithAWarning) {

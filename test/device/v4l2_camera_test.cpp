@@ -4,11 +4,15 @@
 #include "omnister/device/v4l2_camera.h"
 
 #include <gmock/gmock.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 #include <cstdlib>
 #include <fstream>
 #include <opencv2/imgproc.hpp>
 #include <thread>
+
+#include "temporary_folder.h"
 
 namespace omnister::device {
 namespace {
@@ -33,6 +37,35 @@ bool write(const std::string& path, const std::string& text) {
   return static_cast<bool>(file << text << std::flush);
 }
 
+std::string refusal(const std::string& device, const CameraSettings& settings = {}) {
+  try {
+    openCamera(device, settings);
+  } catch (const CameraError& e) {
+    return e.what();
+  }
+  return "";
+}
+
+TEST(V4l2Errors, SaysWhatIsWrongWithAPath) {
+  EXPECT_THAT(refusal("v4l2:/dev/video77"), HasSubstr("/dev/video77 cannot be opened: No such"));
+  EXPECT_THAT(refusal("v4l2:/dev/null"), HasSubstr("/dev/null is no camera"));
+  EXPECT_THAT(refusal("v4l2:nothing"), HasSubstr("no camera \"nothing\" is there"));
+}
+
+TEST(V4l2Errors, NamesTheGroupThatMayUseACamera) {
+  if (geteuid() != 0) GTEST_SKIP() << "needs to be another user";
+  const test::TemporaryFolder folder;
+  const std::string path = (folder.path() / "video0").string();
+  ASSERT_TRUE(write(path, ""));
+  chmod(path.c_str(), 0600);
+  chmod(folder.path().c_str(), 0755);
+  ASSERT_EQ(seteuid(65534), 0);
+  const std::string message = refusal("v4l2:" + path);
+  ASSERT_EQ(seteuid(0), 0);
+  EXPECT_THAT(message,
+              testing::AllOf(HasSubstr("no permission to open " + path), HasSubstr("group video")));
+}
+
 class Vivid : public testing::Test {
  protected:
   void SetUp() override {
@@ -47,12 +80,7 @@ class Vivid : public testing::Test {
     return openCamera("v4l2:platform:vivid-00" + std::to_string(number), settings_);
   }
   std::string refusal(const std::string& device) const {
-    try {
-      openCamera(device, settings_);
-    } catch (const CameraError& e) {
-      return e.what();
-    }
-    return "";
+    return device::refusal(device, settings_);
   }
   CameraSettings settings_;
 };

@@ -5,6 +5,7 @@
 #include <rosgraph_msgs/Log.h>
 #include <std_srvs/Trigger.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <fstream>
 #include <sstream>
@@ -41,6 +42,20 @@ class AravisDriver : public testing::Test {
   }
   void drive() { driver_ = std::make_unique<CameraDriver>(node_, private_, parameters_); }
 
+  /// camera_node as a process of its own.
+  std::unique_ptr<test::ChildProcess> startNode(std::vector<std::string> arguments) {
+    output_ = (folder_.path() / arguments.at(0)).string();
+    arguments.insert(arguments.begin(),
+                     std::filesystem::read_symlink("/proc/self/exe").parent_path() / "camera_node");
+    return std::make_unique<test::ChildProcess>(arguments, output_);
+  }
+  /// What the last one printed.
+  std::string said() const {
+    std::stringstream text;
+    text << std::ifstream(output_).rdbuf();
+    return text.str();
+  }
+
   /// @return the configuration as the node tells it
   dynamic_reconfigure::Config configure(const std::string& key, double value) {
     ros::ServiceClient client =
@@ -64,6 +79,7 @@ class AravisDriver : public testing::Test {
   static int count_;
   ros::NodeHandle node_, private_;
   test::TemporaryFolder folder_;
+  std::string output_;
   sim::GigeServerOptions options_;
   CameraParameters parameters_;
   std::unique_ptr<sim::GigeServer> server_;
@@ -153,15 +169,60 @@ TEST_F(AravisDriver, DiagnosticsTellOfTheLink) {
 
 TEST_F(AravisDriver, ANodeThatCannotStartSaysWhy) {
   ros::NodeHandle().setParam("bad_camera/frame_rate", -1.0);
-  const std::string output = (folder_.path() / "output").string();
-  test::ChildProcess node(
-      {std::filesystem::read_symlink("/proc/self/exe").parent_path() / "camera_node",
-       "__name:=bad_camera"},
-      output);
-  EXPECT_EQ(node.wait(), 1);
-  std::stringstream text;
-  text << std::ifstream(output).rdbuf();
-  EXPECT_THAT(text.str(), testing::AllOf(HasSubstr("/bad_camera/frame_rate"), HasSubstr("-1")));
+  const std::unique_ptr<test::ChildProcess> node = startNode({"__name:=bad_camera"});
+  EXPECT_EQ(node->wait(), 1);
+  EXPECT_THAT(said(), testing::AllOf(HasSubstr("/bad_camera/frame_rate"), HasSubstr("-1")));
+}
+
+TEST_F(AravisDriver, ANodeWithoutItsCameraEndsOrTriesAgainAsItIsTold) {
+  serve();
+  const std::unique_ptr<test::ChildProcess> ending =
+      startNode({"__name:=ending", "_device:=aravis:nobody", "_exit_on_error:=true"});
+  EXPECT_EQ(ending->wait(), 1);
+  // One clear line, that names what there is.
+  EXPECT_THAT(said(), testing::AllOf(HasSubstr("no camera \"nobody\" is there; there are: "),
+                                     HasSubstr("R-1 at 127.0.0.1")));
+
+  const std::unique_ptr<test::ChildProcess> staying =
+      startNode({"__name:=staying", "_device:=aravis:nobody", "_retry_period:=0.1"});
+  EXPECT_TRUE(eventually(
+      [&] {
+        return said().find("no camera, trying again every 0.1 s: no camera") != std::string::npos;
+      },
+      kLong));
+  staying->signal(SIGINT);
+  EXPECT_EQ(staying->wait(), 0);
+}
+
+TEST_F(AravisDriver, ABusyCameraAndAFormatThatItDoesNotHaveAreToldAndWaitedFor) {
+  serve();
+  parameters_.device = "aravis:127.0.0.1";
+  Collector<rosgraph_msgs::Log> log(ros::NodeHandle(), "/rosout");
+  const auto told = [&](const std::string& text) {
+    const auto lines = log.messages();
+    return std::any_of(lines.begin(), lines.end(), [&](const rosgraph_msgs::Log::ConstPtr& line) {
+      return line->level == rosgraph_msgs::Log::WARN &&
+             line->msg.find("no camera, trying again") == 0 &&
+             line->msg.find(text) != std::string::npos;
+    });
+  };
+  std::unique_ptr<device::Camera> other =
+      device::openCamera(parameters_.device, parameters_.settings);
+  drive();
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  EXPECT_TRUE(eventually([&] { return told("is busy: another program controls it"); }, kLong));
+  EXPECT_EQ(images.size(), 0u);
+  other.reset();
+  EXPECT_TRUE(eventually([&] { return images.size() > 0; }, kLong));
+  driver_.reset();
+
+  parameters_.settings.pixel_format = "Mono12Packed";
+  drive();
+  EXPECT_TRUE(eventually(
+      [&] {
+        return told("has no pixel format \"Mono12Packed\"; it offers Mono8, Mono16, BayerRG8");
+      },
+      kLong));
 }
 
 TEST_F(AravisDriver, WhatIsNotKnownOfACameraIsNotWrittenToItsParameters) {

@@ -283,6 +283,25 @@ TEST_F(CameraTest, APartOfTheSensorIsToldByRep104) {
   EXPECT_EQ(info->roi.y_offset, 6u);
   EXPECT_EQ(info->roi.width, 16u);
   EXPECT_EQ(info->roi.height, 12u);
+
+  // The lens model is that of the images themselves, and of the same rays.
+  Collector<LensModelMessage> models(node_, "lens_model");
+  ASSERT_TRUE(eventually([&] { return models.size() > 0; }));
+  const LensFile part = fromLensModelMessage(*models.last(), "lens_model");
+  EXPECT_EQ(part.image_size, cv::Size(8, 6));
+  int compared = 0;
+  for (int y = 0; y < 6; ++y) {
+    for (int x = 0; x < 8; ++x) {
+      // The middle of two by two pixels of the sensor.
+      const auto whole = file.lens->unproject({4 + 2 * x + 0.5, 6 + 2 * y + 0.5});
+      const auto ray = part.lens->unproject(Eigen::Vector2d(x, y));
+      ASSERT_EQ(whole.has_value(), ray.has_value());
+      if (!ray) continue;
+      EXPECT_LT((*ray - *whole).norm(), 1e-9);
+      ++compared;
+    }
+  }
+  EXPECT_GT(compared, 20);
 }
 
 TEST_F(CameraTest, ImagesAreTheDevicesOwnMemoryWhichGoesRound) {

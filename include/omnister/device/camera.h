@@ -38,6 +38,7 @@ struct Frame {
   std::string encoding;        ///< sensor_msgs/image_encodings name, e.g. "mono8", "bayer_rggb8"
   Stamp stamp;                 ///< middle of the exposure
   std::uint64_t sequence = 0;  ///< counts up by one; a gap is a lost frame
+  std::uint64_t number = 0;    ///< as the device numbers it, which may wrap; 0: it does not
   std::optional<SensorRegion> region;      ///< where the device tells it
   std::optional<double> stage_position_m;  ///< where the backend knows it (recordings) [m]
   std::optional<bool> settled;             ///< the stage stood still during the exposure

@@ -2,13 +2,14 @@
 /// @file The body of the camera node and nodelet.
 ///
 /// Publishes `image_raw` and `camera_info` with identical headers (stamp: middle of the exposure),
-/// latched `lens_model`, `/diagnostics`, and the static frames of its mount. A lens that another
-/// node publishes on `lens_model` for our frame is taken over. The device is opened at once by a
-/// thread of its own, streams only while someone listens, and is opened again when it was lost: the
-/// same camera, with the settings it had. What can change while it streams is changed by
-/// dynamic_reconfigure; `trigger` exposes once. A recording that knows stage positions also
-/// publishes `stage_state` and the stage's tf. What `set_camera_info` is given is kept in the
-/// store, as a lens surface.
+/// latched `lens_model` (of the images: where they show a part of the sensor, of that part; in
+/// `camera_info` the calibration stays that of the sensor, as REP 104 wants it), `/diagnostics`,
+/// and the static frames of its mount. A lens that another node publishes on `lens_model` for our
+/// frame is taken over. The device is opened at once by a thread of its own, streams only while
+/// someone listens, and is opened again when it was lost: the same camera, with the settings it
+/// had. What can change while it streams is changed by dynamic_reconfigure; `trigger` exposes once.
+/// A recording that knows stage positions also publishes `stage_state` and the stage's tf. What
+/// `set_camera_info` is given is kept in the store, as a lens surface.
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
@@ -87,14 +88,13 @@ class CameraDriver {
   struct Lens {
     LensFile file;
     sensor_msgs::CameraInfo info;
-    std::string yaml;
   };
 
   void run();
   void stream();
   void openIfNeeded();
   void close(const std::string& problem);
-  bool wanted() const;
+  bool wanted();
   void waitFor(double seconds);
   void publish(const device::Frame& frame);
   sensor_msgs::CameraInfoPtr infoFor(const device::Frame& frame) const;
@@ -117,6 +117,10 @@ class CameraDriver {
 
   void chooseLens();
   void setLens(LensFile file);
+  /// The lens of the images that come: of the part of the sensor that they show.
+  void publishLens();
+  /// The images show a part of the sensor, and the lens is of all of it.
+  bool lensIsOfMore() const;
   /// Takes over a lens that a calibration publishes beside us.
   void onLens(const LensModelMessage::ConstPtr& message);
   bool setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
@@ -133,11 +137,14 @@ class CameraDriver {
   mutable std::mutex mutex_;
   std::condition_variable wake_;
   std::shared_ptr<const Lens> lens_;
+  std::optional<device::SensorRegion> region_;  // of the last frame
+  std::string published_lens_;
   device::CameraIdentity identity_;
   std::string state_ = "opening";
   std::string problem_;
   std::uint64_t frames_ = 0;
   std::uint64_t lost_ = 0;
+  std::uint64_t last_number_ = 0;
   std::uint64_t losses_of_device_ = 0;
   std::uint64_t frames_at_last_report_ = 0;
   std::uint64_t lost_at_last_report_ = 0;
@@ -152,6 +159,8 @@ class CameraDriver {
   std::unique_ptr<device::Camera> camera_;
   device::CameraSettings settings_;
   bool streaming_ = false;
+  bool wanted_ = false;
+  std::chrono::steady_clock::time_point wanted_due_;
   bool streamed_ = false;   // a frame came since it was started
   std::uint64_t torn_ = 0;  // incomplete frames when whole ones still came
   double slowest_s_ = 0.0;  // as long as the device itself may take for a frame

@@ -2,12 +2,14 @@
 /// @file A GigE Vision camera made of software: discovery, registers and image stream travel over
 /// UDP as those of a real one, so that a driver cannot tell the difference.
 ///
-/// The protocol is Aravis' own fake camera; what it shows is drawn by a function of ours, in a
-/// thread of ours, so that the control channel answers while a frame is rendered. It offers, by
+/// Its registers are those of Aravis' fake camera and some more; what it shows is drawn by a
+/// function of ours, in a thread of ours, so that the control channel answers while a frame is
+/// rendered. Packets of the stream can get lost, and are sent again when asked for. It offers, by
 /// their SFNC names: PixelFormat (Mono8, Mono16, BayerRG8, RGB8, BGR8), Width, Height, OffsetX,
 /// OffsetY, BinningHorizontal, BinningVertical, AcquisitionFrameRate, ExposureTime, Gain,
 /// BlackLevel, TriggerMode, TriggerSource (Software, Line0), TriggerSoftware, DeviceTemperature,
-/// TimestampLatch, TimestampLatchValue, PtpEnable, PtpStatus. Its clock starts at an arbitrary
+/// TimestampLatch, TimestampLatchValue, PtpEnable, PtpStatus, ChunkModeActive, ChunkSelector,
+/// ChunkEnable, ChunkExposureTime, ChunkTimestamp. Its clock starts at an arbitrary
 /// number and runs freely until PtpEnable; then it is the host's. Time stamps of frames are the
 /// start of their exposure.
 #pragma once
@@ -23,13 +25,14 @@
 namespace omnister::sim {
 
 struct GigeServerOptions {
-  std::string interface = "127.0.0.1";  ///< name or address of a network interface
+  std::string interface = "127.0.0.1";  ///< name or address of a network interface, or 127.x.y.z
   std::string serial = "sim-camera";    ///< 1 to 15 characters
   cv::Size size = {1280, 800};          ///< of the sensor [px]
   double frame_rate_hz = 5.0;           ///< at power-up; a slow drawing makes it fewer
   double exposure_us = 5000.0;          ///< at power-up
   bool color = true;                    ///< BGR8 at power-up, else Mono8
   double packet_loss = 0.0;             ///< share of the stream's packets that get lost, 0 to 1
+  bool packet_resend = true;            ///< it can send them again
 };
 
 /// What the camera sees in the middle of an exposure: CV_8UC1 or CV_8UC3 (BGR) of the sensor's
@@ -53,8 +56,12 @@ class GigeServer {
   void setPacketLoss(double share);
   /// A pulse on Line0.
   void pulseLine0();
+  /// As an automatic exposure would: nobody is told [us].
+  void setExposure(double us);
   /// Frames sent since power-up.
   std::uint64_t framesSent() const;
+  /// Packets that a client asked for again, and that were sent.
+  std::uint64_t packetsSentAgain() const;
   /// Why no frame could be drawn; empty when all is well.
   std::string problem() const;
 

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // One suite for every model and structure; closed forms of the single models below it.
 #include "omnister/lens/lens_models.h"
-#include "omnister/lens/reduced_lens.h"
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
@@ -12,6 +11,8 @@
 #include <random>
 
 #include "omnister/common/error.h"
+#include "omnister/lens/lens_part.h"
+#include "omnister/lens/reduced_lens.h"
 
 namespace omnister {
 namespace {
@@ -390,6 +391,36 @@ TEST_P(EveryLens, StructureAndNumbersComeBack) {
   for (const auto& n : field(GetParam().max_theta, 10, 5)) {
     EXPECT_EQ(*again->project(n), *lens_->project(n));
   }
+}
+
+TEST_P(EveryLens, APartOfTheSensorSeesTheSameRays) {
+  LensFile whole;
+  whole.image_size = {1280, 960};
+  whole.lens = lens_;
+  whole.calibration.rms_px = 0.3;
+  for (const cv::Size& binning : {cv::Size(1, 1), cv::Size(2, 2), cv::Size(4, 4), cv::Size(2, 1)}) {
+    const LensFile part = partOfLens(whole, {101, 60, 900, 701}, binning);
+    EXPECT_EQ(part.image_size, cv::Size(900 / binning.width, 701 / binning.height));
+    EXPECT_EQ(part.lens->model(), lens_->model());
+    std::size_t done = 0;
+    const auto bearings = field(GetParam().max_theta, 20, 9);
+    for (const auto& bearing : bearings) {
+      const auto pixel = lens_->project(bearing);
+      const auto there = part.lens->project(bearing);
+      ASSERT_TRUE(pixel && there) << bearing.transpose();
+      // Pixel u of the part covers those from 101 + bins u on.
+      const Eigen::Vector2d bins(binning.width, binning.height);
+      const Eigen::Vector2d expected =
+          (pixel->array() - Eigen::Array2d(101, 60) + 0.5) / bins.array() - 0.5;
+      EXPECT_LT((*there - expected).norm(), 1e-8 * (1.0 + pixel->norm()));
+      ++done;
+    }
+    EXPECT_EQ(done, bearings.size());
+    EXPECT_EQ(part.calibration.rms_px, 0.3 / binning.height);
+  }
+  EXPECT_THROW(partOfLens(whole, {400, 0, 900, 100}, {1, 1}), InputError);
+  EXPECT_THROW(partOfLens(whole, {0, 0, 3, 3}, {4, 4}), InputError);
+  EXPECT_THROW(partOfLens(whole, {0, 0, 8, 8}, {0, 1}), InputError);
 }
 
 TEST_P(EveryLens, RefusesNumbersThatMakeNoLens) {
