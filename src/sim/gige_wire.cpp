@@ -42,13 +42,8 @@ enum Command : std::uint16_t {
   kReadMemory = 0x0084,
   kWriteMemory = 0x0086,
 };
-enum Status : std::uint16_t {
-  kDone = 0x0000,
-  kNotImplemented = 0x8001,
-  kInvalidParameter = 0x8002,
-  kInvalidAddress = 0x8003,
-  kAccessDenied = 0x8006,
-};
+constexpr std::uint16_t kDone = 0x0000, kNotImplemented = 0x8001, kInvalidParameter = 0x8002,
+                        kInvalidAddress = 0x8003, kAccessDenied = 0x8006;
 constexpr std::uint8_t kLeader = 1, kTrailer = 2, kPayload = 3;
 constexpr std::uint16_t kImage = 0x0001, kWithChunks = 0x4000;
 

@@ -266,6 +266,7 @@ TEST_F(CameraTest, APartOfTheSensorIsToldByRep104) {
   // The lens is of the whole sensor, the image a binned part of it.
   LensFile file = lens();
   file.image_size = {32, 24};
+  file.lens = makeLens(structureOf(*file.lens), Eigen::Vector2d(15.5, 11.5), 16.0, 1.2);
   parameters_.lens = (folder_.path() / "lens.yaml").string();
   writeLensFile(parameters_.lens, file);
   state_.region = device::SensorRegion{{32, 24}, {4, 6, 16, 12}, {2, 2}};
