@@ -393,12 +393,19 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
         }
       }
       float a_min = std::numeric_limits<float>::max(), a_max = -a_min;
+      std::uint16_t phi_min = kNoRay, phi_max = 0;
       for (int v = tile.rect.y; v < tile.rect.br().y; ++v) {
-        for (int u = tile.rect.x; u < tile.rect.br().x; ++u) {
-          const std::size_t i = view.at(u, v);
-          if (view.phi[i] == kNoRay) continue;
-          a_min = std::min(a_min, view.a[i]);
-          a_max = std::max(a_max, view.a[i]);
+        const std::size_t row = view.at(tile.rect.x, v);
+        // Without branches.
+        for (int u = 0; u < tile.rect.width; ++u) {
+          const std::uint16_t phi = view.phi[row + u];
+          const float a = view.a[row + u];
+          const bool seen = phi != kNoRay;
+          const float low = seen ? a : a_min, high = seen ? a : a_max;
+          a_min = low < a_min ? low : a_min;
+          a_max = high > a_max ? high : a_max;
+          phi_min = std::min(phi_min, phi);
+          phi_max = std::max(phi_max, seen ? phi : phi_max);
         }
       }
       if (!phi.empty() && a_min <= a_max) {
@@ -410,6 +417,8 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
         scale.a = middle(a);
         tile.a_min = a_min;
         tile.a_max = a_max;
+        tile.phi_min = phi_min;
+        tile.phi_max = phi_max;
         const double theta_min = thetaOf(map.axis, a_min), theta_max = thetaOf(map.axis, a_max);
         scale.left = theta_min + theta_max < kPi;
         double h_min = std::numeric_limits<double>::max(), h_max = 0;
@@ -478,38 +487,44 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
   constexpr int kMargin = 10;  // rows and columns kept around them
 
   // Rows and columns that the tiles can reach.
+  struct Reach {
+    int band, row, first, last;
+  };
+  std::vector<Reach> reaches;
   std::vector<std::pair<int, int>> row_range(
       grid.bands.size(), {std::numeric_limits<int>::max(), std::numeric_limits<int>::min()});
   MapView view;
-  const auto visit = [&](const auto& action) {
-    for (const Tile& tile : layout->tiles) {
-      if (tile.band < 0) continue;
-      const Band& band = grid.bands[tile.band];
-      const double to_row = 1.0 / (kPhiUnits * band.step_phi), row0 = -kPi / band.step_phi;
-      const double to_column = column_sign_scale / band.step_h;
-      const cv::Rect rect = tile.rect;
-      viewMap(map, rect + cv::Size(2 * halo, 2 * halo) - cv::Point(halo, halo), &view);
-      for (int v = rect.y - halo;; v = std::min(v + kSample, rect.br().y + halo - 1)) {
-        const int y = std::clamp(v, 0, map.size.height - 1);
-        for (int u = rect.x - halo;; u = std::min(u + kSample, rect.br().x + halo - 1)) {
-          const int x = std::clamp(u, 0, map.size.width - 1);
-          const std::size_t i = view.at(x, y);
-          if (view.phi[i] != kNoRay) {
-            const int row = static_cast<int>(std::lround(view.phi[i] * to_row + row0));
-            const double column = view.a[i] * to_column;
-            action(tile.band, row, static_cast<int>(std::floor(column + tile.h_min / band.step_h)),
-                   static_cast<int>(std::ceil(column + tile.h_max / band.step_h)));
-          }
-          if (u == rect.br().x + halo - 1) break;
-        }
-        if (v == rect.br().y + halo - 1) break;
-      }
-    }
+  // Rounding by a cast, which is not a call.
+  const auto floorOf = [](double x) {
+    const int whole = static_cast<int>(x);
+    return whole - (x < whole ? 1 : 0);
   };
-  visit([&](int band, int row, int, int) {
-    row_range[band].first = std::min(row_range[band].first, row);
-    row_range[band].second = std::max(row_range[band].second, row);
-  });
+  for (const Tile& tile : layout->tiles) {
+    if (tile.band < 0) continue;
+    const Band& band = grid.bands[tile.band];
+    const double to_row = 1.0 / (kPhiUnits * band.step_phi), row0 = -kPi / band.step_phi;
+    const double to_column = column_sign_scale / band.step_h;
+    const double least = tile.h_min / band.step_h, most = tile.h_max / band.step_h;
+    auto& [first_row, last_row] = row_range[tile.band];
+    const cv::Rect rect = tile.rect;
+    for (int v = rect.y - halo;; v = std::min(v + kSample, rect.br().y + halo - 1)) {
+      const int y = std::clamp(v, 0, map.size.height - 1);
+      viewMap(map, cv::Rect(rect.x - halo, y, rect.width + 2 * halo, 1), &view);
+      for (int u = rect.x - halo;; u = std::min(u + kSample, rect.br().x + halo - 1)) {
+        const int x = std::clamp(u, 0, map.size.width - 1);
+        const std::size_t i = view.at(x, y);
+        if (view.phi[i] != kNoRay) {
+          const int row = floorOf(view.phi[i] * to_row + row0 + 0.5);
+          const double column = view.a[i] * to_column;
+          first_row = std::min(first_row, row);
+          last_row = std::max(last_row, row);
+          reaches.push_back({tile.band, row, floorOf(column + least), floorOf(column + most) + 1});
+        }
+        if (u == rect.br().x + halo - 1) break;
+      }
+      if (v == rect.br().y + halo - 1) break;
+    }
+  }
   std::vector<std::vector<std::pair<int, int>>> spans(grid.bands.size());
   for (std::size_t b = 0; b < grid.bands.size(); ++b) {
     Band& band = grid.bands[b];
@@ -520,11 +535,12 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
     band.row_offset = -kPi / band.step_phi - row0;
     spans[b].assign(band.rows, {std::numeric_limits<int>::max(), std::numeric_limits<int>::min()});
   }
-  visit([&](int b, int row, int lo, int hi) {
-    auto& span = spans[b][row - (row_range[b].first - kMargin)];
-    span.first = std::min(span.first, lo);
-    span.second = std::max(span.second, hi);
-  });
+  for (const Reach& reach : reaches) {
+    auto& span = spans[reach.band][reach.row - (row_range[reach.band].first - kMargin)];
+    span.first = std::min(span.first, reach.first);
+    span.second = std::max(span.second, reach.last);
+  }
+  reaches = {};
 
   std::int64_t cells = 0, nodes = 0;
   for (std::size_t b = 0; b < grid.bands.size(); ++b) {
@@ -713,18 +729,10 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
     Tile& tile = layout->tiles[t];
     if (tile.band < 0) return;
     const Band& band = grid.bands[tile.band];
-    int first_row = band.rows, last_row = -1;
-    MapView view;
-    viewMap(map, tile.rect, &view);
-    for (int y = tile.rect.y; y < tile.rect.br().y; ++y) {
-      for (int x = tile.rect.x; x < tile.rect.br().x; ++x) {
-        const std::uint16_t phi = view.phi[view.at(x, y)];
-        if (phi == kNoRay) continue;
-        const int row = static_cast<int>(std::lround(phi * band.row_scale + band.row_offset));
-        first_row = std::min(first_row, row);
-        last_row = std::max(last_row, row);
-      }
-    }
+    const auto rowOf = [&](std::uint16_t phi) {
+      return static_cast<int>(std::lround(phi * band.row_scale + band.row_offset));
+    };
+    const int first_row = rowOf(tile.phi_min), last_row = rowOf(tile.phi_max);
     const double ends[2] = {tile.a_min * column_sign_scale / band.step_h,
                             tile.a_max * column_sign_scale / band.step_h};
     const double lowest = std::min(ends[0], ends[1]) + tile.h_min / band.step_h - 2;

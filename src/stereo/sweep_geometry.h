@@ -103,6 +103,7 @@ struct Tile {
   cv::Rect rect;
   int band = -1;               ///< -1: no pixel of it has a ray
   float a_min = 0, a_max = 0;  ///< axis coordinates of its pixels
+  std::uint16_t phi_min = 0, phi_max = 0;
   float h_min = 0, h_max = 0;  ///< hypotheses worth trying
   bool clear = false;          ///< every cell it can reach sees the image
 };
