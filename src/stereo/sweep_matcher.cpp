@@ -8,6 +8,7 @@
 #include <chrono>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <opencv2/core.hpp>
 #include <utility>
 
@@ -326,14 +327,16 @@ class SweepMatcher : public SweepPair {
     int alike = 0, all = 0;
     for (int y = 0; y + kWindow <= height; y += 3 * kWindow) {
       for (int x = 0; x + kWindow <= width; x += 2 * kWindow) {
-        float sum = 0, squares = 0;
+        float sums[kWindow] = {}, all_squares[kWindow] = {};  // by column: these are vectors
         for (int v = y; v < y + kWindow; ++v) {
-          for (int u = x; u < x + kWindow; ++u) {
-            const float r = residual[v * stride + u];
-            sum += r;
-            squares += r * r;
+          for (int u = 0; u < kWindow; ++u) {
+            const float r = residual[v * stride + x + u];
+            sums[u] += r;
+            all_squares[u] += r * r;
           }
         }
+        const float sum = std::accumulate(sums, sums + kWindow, 0.0f);
+        const float squares = std::accumulate(all_squares, all_squares + kWindow, 0.0f);
         constexpr float kCount = kWindow * kWindow;
         // Spread evenly over a column the variance is 1/12.
         alike += squares / kCount - sum * sum / (kCount * kCount) < 0.04f;

@@ -137,6 +137,10 @@ void RejectRow(RejectJob* in_out) {
     const auto h = hn::LoadU(df, job.h[1] + x);
     const auto known =
         hn::And(hn::RebindMask(df, hn::Lt(Count(di, x), hn::Set(di, count))), hn::Eq(h, h));
+    if (hn::AllFalse(df, known)) {
+      hn::StoreU(hn::NaN(df), df, job.out + x);
+      continue;
+    }
     hn::Vec<decltype(di)> element, mine;
     Claim(di, job.claimed, x, &element, &mine);
     hn::Store(element, di, at);
@@ -188,6 +192,10 @@ void MedianRow(const float* const rows[3], int count, float* HWY_RESTRICT out) {
   const int lanes = static_cast<int>(hn::Lanes(d));
   for (int x = 0; x < count; x += lanes) {
     const auto middle = hn::LoadU(d, rows[1] + x);
+    if (hn::AllTrue(d, hn::IsNaN(middle))) {
+      StoreFront(d, middle, out + x, count - x);
+      continue;
+    }
     const auto load = [&](int row, int dx) {
       const auto v = hn::LoadU(d, rows[row] + x + dx);
       return hn::IfThenElse(hn::IsNaN(v), middle, v);
@@ -239,6 +247,11 @@ void TriangulateRow(TriangulateJob* job) {
     const auto h = whole ? hn::LoadU(d, job->h + x) : hn::Load(d, ends);
     const auto a = hn::LoadU(d, job->a + x);
     const auto known = hn::And(in, hn::Not(hn::IsNaN(h)));
+    if (hn::AllFalse(d, known)) {
+      for (float* to : {job->range, job->sigma, job->score})
+        StoreFront(d, nan, to + x, job->count - x);
+      continue;
+    }
     const auto cost = load(job->cost + x);
     const auto steep = hn::Max(load(job->steep + x), hn::Set(d, 1.0f));
     const auto one = hn::Set(d, 1.0f);
