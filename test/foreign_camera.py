@@ -10,11 +10,12 @@ CAMERA = 'arv-fake-gv-camera-0.8'
 
 
 class Camera:
-    def __init__(self):
+    def __init__(self, address='127.0.0.1', serial='ENDURE'):
+        self.address, self.serial = address, serial
         self.process = None
 
     def start(self, lost_per_thousand=0):
-        self.process = subprocess.Popen([CAMERA, '-i', '127.0.0.1', '-s', 'ENDURE', '-r', str(lost_per_thousand)],
+        self.process = subprocess.Popen([CAMERA, '-i', self.address, '-s', self.serial, '-r', str(lost_per_thousand)],
                                         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def signal(self, number):
@@ -37,10 +38,10 @@ def enter_own_network():
     """Starts this program again in a network of its own, where nobody else's cameras are, if that is allowed."""
     if 'FOREIGN_CAMERA' in os.environ or not shutil.which('unshare') or not shutil.which('ip'):
         return
-    os.environ['FOREIGN_CAMERA'] = 'own network'
     alone = ['unshare', '-n'] if os.getuid() == 0 else ['unshare', '-rn']
     if subprocess.call(alone + ['true'], stderr=subprocess.DEVNULL) == 0:
-        os.execvp('unshare', alone + ['sh', '-c', 'ip link set lo up && exec "$@"', 'sh', sys.executable] + sys.argv)
+        os.environ['FOREIGN_CAMERA'] = 'own network'
+        os.execvp('unshare', alone + ['sh', '-c', 'ip link set lo up && ip addr add 127.0.0.2/8 dev lo && exec "$@"', 'sh', sys.executable] + sys.argv)
 
 
 class Master:
