@@ -350,8 +350,9 @@ std::vector<std::vector<int>> targetSymmetries(const Target& target) {
   }
   std::vector<std::vector<int>> orders;
   for (const int turn : turns) {
-    std::vector<int>& order = orders.emplace_back(grid.prod());
+    std::vector<int> order(grid.prod());
     for (int id = 0; id < grid.prod(); ++id) order[id] = turned(id, turn, grid.x(), grid.y());
+    orders.push_back(std::move(order));
   }
   return orders;
 }

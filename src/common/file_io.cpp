@@ -26,7 +26,6 @@ class FileDescriptor {
   FileDescriptor(const FileDescriptor&) = delete;
   FileDescriptor& operator=(const FileDescriptor&) = delete;
   int get() const { return fd_; }
-  int close() { return ::close(std::exchange(fd_, -1)); }
 
  private:
   int fd_;
@@ -46,27 +45,36 @@ mode_t modeFor(const fs::path& target) {
 
 fs::path temporaryFor(const fs::path& target) {
   static std::atomic<unsigned> counter{0};
-  // The extension stays last, since codecs choose the format by it.
-  return folderOf(target) / ("." + target.stem().string() + "." + std::to_string(::getpid()) + "-" +
-                             std::to_string(counter++) + ".tmp" + target.extension().string());
+  // As long as any name that the folder takes, whatever the target's is.
+  return folderOf(target) / ("." + target.filename().string().substr(0, 200) + "." +
+                             std::to_string(::getpid()) + "-" + std::to_string(counter++) + ".tmp");
 }
 
-void syncPath(const fs::path& path, int flags) {
-  FileDescriptor fd(::open(path.c_str(), flags | O_CLOEXEC));
+void syncFolder(const fs::path& path) {
+  FileDescriptor fd(::open(path.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC));
   if (fd.get() < 0) throw IoError("open", path.string(), errno);
   if (::fsync(fd.get()) != 0 && errno != EINVAL && errno != EROFS) {
     throw IoError("sync", path.string(), errno);
   }
 }
 
-void writeAll(int fd, std::string_view bytes, const fs::path& path) {
-  while (!bytes.empty()) {
-    const ssize_t n = ::write(fd, bytes.data(), bytes.size());
-    if (n < 0) {
-      if (errno == EINTR) continue;
-      throw IoError("write", path.string(), errno);
+// A second name for the file that stands at `target`, or a copy where one file has one name (FAT).
+void keepPrevious(const fs::path& target) {
+  const fs::path backup = target.string() + "~";
+  // A hard link made beside and renamed: at no moment is either version missing.
+  const fs::path link = temporaryFor(backup);
+  if (::link(target.c_str(), link.c_str()) == 0) {
+    if (::rename(link.c_str(), backup.c_str()) != 0) {
+      const int reason = errno;
+      ::unlink(link.c_str());
+      throw IoError("write", backup.string(), reason);
     }
-    bytes.remove_prefix(static_cast<std::size_t>(n));
+    // rename() of two names of one file leaves both in place.
+    ::unlink(link.c_str());
+  } else if (errno == EPERM || errno == EOPNOTSUPP || errno == EMLINK) {
+    writeFileAtomically(backup, readFile(target));
+  } else if (errno != ENOENT) {
+    throw IoError("write", backup.string(), errno);
   }
 }
 
@@ -104,50 +112,110 @@ std::string readFile(const fs::path& path, std::size_t max_bytes) {
   }
 }
 
-AtomicFile::AtomicFile(fs::path path)
-    : target_(resolveLink(std::move(path))), temporary_(temporaryFor(target_)) {}
+AtomicFile::AtomicFile(fs::path path) : target_(resolveLink(path)) {
+  struct stat info {};
+  if (::stat(path.c_str(), &info) == 0 && !S_ISREG(info.st_mode)) {
+    openDirectly(path, info.st_mode);
+    return;
+  }
+  // A file without a name gets one through /proc.
+  if (::access("/proc/self/fd", X_OK) == 0) {
+    fd_ = ::open(folderOf(target_).c_str(), O_TMPFILE | O_WRONLY | O_CLOEXEC, 0644);
+    if (fd_ >= 0) return;
+  }
+  const fs::path name = temporaryFor(target_);
+  fd_ = ::open(name.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0644);
+  // Name the file that was asked for, not the temporary one.
+  if (fd_ < 0) throw IoError("write", target_.string(), errno);
+  temporary_ = name;
+}
+
+void AtomicFile::openDirectly(const fs::path& path, mode_t mode) {
+  if (S_ISDIR(mode)) throw IoError("write", path.string(), EISDIR);
+  if (!S_ISCHR(mode) && !S_ISFIFO(mode)) {
+    throw InputError(path.string(), "", "is no regular file and cannot be written");
+  }
+  // A pipe that nobody reads would wait for ever.
+  fd_ = ::open(path.c_str(), O_WRONLY | O_CLOEXEC | O_NOCTTY | O_NONBLOCK);
+  if (fd_ < 0) throw IoError("write", path.string(), errno);
+  ::fcntl(fd_, F_SETFL, ::fcntl(fd_, F_GETFL) & ~O_NONBLOCK);
+  direct_ = true;
+}
 
 AtomicFile::~AtomicFile() {
-  if (!committed_) ::unlink(temporary_.c_str());
+  if (fd_ >= 0) ::close(fd_);
+  if (!temporary_.empty()) ::unlink(temporary_.c_str());
+}
+
+void AtomicFile::write(std::string_view bytes) {
+  while (!bytes.empty()) {
+    const ssize_t n = ::write(fd_, bytes.data(), bytes.size());
+    if (n < 0) {
+      if (errno == EINTR) continue;
+      throw IoError("write", target_.string(), errno);
+    }
+    bytes.remove_prefix(static_cast<std::size_t>(n));
+  }
+}
+
+void AtomicFile::finish() {
+  std::error_code error;
+  if (fs::is_directory(target_, error)) throw IoError("write", target_.string(), EISDIR);
+  ::fchmod(fd_, modeFor(target_));
+  if (::fsync(fd_) != 0 && errno != EINVAL && errno != EROFS) {
+    throw IoError("sync", target_.string(), errno);
+  }
+}
+
+int AtomicFile::giveName(const fs::path& name) {
+  if (temporary_.empty()) {
+    const std::string self = "/proc/self/fd/" + std::to_string(fd_);
+    return ::linkat(AT_FDCWD, self.c_str(), AT_FDCWD, name.c_str(), AT_SYMLINK_FOLLOW) == 0 ? 0
+                                                                                            : errno;
+  }
+  if (::renameat2(AT_FDCWD, temporary_.c_str(), AT_FDCWD, name.c_str(), RENAME_NOREPLACE) == 0) {
+    temporary_.clear();
+    return 0;
+  }
+  if (errno != EINVAL && errno != ENOSYS) return errno;
+  return ::link(temporary_.c_str(), name.c_str()) == 0 ? 0 : errno;
 }
 
 void AtomicFile::commit(Previous previous) {
-  std::error_code error;
-  if (fs::is_directory(target_, error)) throw IoError("write", target_.string(), EISDIR);
-  ::chmod(temporary_.c_str(), modeFor(target_));
-  syncPath(temporary_, O_RDONLY);
-  if (previous == Previous::kKeep) {
-    // A hard link made beside and renamed: at no moment is either version missing.
-    const fs::path backup = target_.string() + "~";
-    const fs::path link = temporaryFor(backup);
-    if (::link(target_.c_str(), link.c_str()) == 0) {
-      if (::rename(link.c_str(), backup.c_str()) != 0) {
-        const int reason = errno;
-        ::unlink(link.c_str());
-        throw IoError("write", backup.string(), reason);
-      }
-      // rename() of two names of one file leaves both in place.
-      ::unlink(link.c_str());
-    } else if (errno != ENOENT) {
-      throw IoError("write", backup.string(), errno);
+  if (direct_) return;
+  finish();
+  if (previous == Previous::kKeep) keepPrevious(target_);
+  const int reason = giveName(target_);
+  if (reason == EEXIST) {
+    if (temporary_.empty()) {
+      const fs::path name = temporaryFor(target_);
+      if (const int failed = giveName(name); failed != 0)
+        throw IoError("write", target_.string(), failed);
+      temporary_ = name;
     }
+    if (::rename(temporary_.c_str(), target_.c_str()) != 0) {
+      throw IoError("write", target_.string(), errno);
+    }
+    temporary_.clear();
+  } else if (reason != 0) {
+    throw IoError("write", target_.string(), reason);
   }
-  if (::rename(temporary_.c_str(), target_.c_str()) != 0) {
-    throw IoError("write", target_.string(), errno);
-  }
-  committed_ = true;
-  syncPath(folderOf(target_), O_RDONLY | O_DIRECTORY);
+  syncFolder(folderOf(target_));
+}
+
+bool AtomicFile::commitNew() {
+  if (direct_) return false;
+  finish();
+  const int reason = giveName(target_);
+  if (reason == EEXIST) return false;
+  if (reason != 0) throw IoError("write", target_.string(), reason);
+  syncFolder(folderOf(target_));
+  return true;
 }
 
 void writeFileAtomically(const fs::path& path, std::string_view bytes, Previous previous) {
   AtomicFile file(path);
-  {
-    FileDescriptor fd(::open(file.path().c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, 0644));
-    // Name the file that was asked for, not the temporary one.
-    if (fd.get() < 0) throw IoError("write", path.string(), errno);
-    writeAll(fd.get(), bytes, path);
-    if (fd.close() != 0) throw IoError("write", path.string(), errno);
-  }
+  file.write(bytes);
   file.commit(previous);
 }
 

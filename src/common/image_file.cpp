@@ -176,7 +176,7 @@ std::unique_ptr<AtomicFile> stageImage(const std::filesystem::path& path, const 
   }
   if (!encoded) throw InputError(path.string(), "", "cannot hold this image");
   auto file = std::make_unique<AtomicFile>(path);
-  writeFileAtomically(file->path(), {reinterpret_cast<const char*>(bytes.data()), bytes.size()});
+  file->write({reinterpret_cast<const char*>(bytes.data()), bytes.size()});
   return file;
 }
 

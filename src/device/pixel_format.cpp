@@ -118,6 +118,21 @@ const PixelFormat* findPixelFormat(const std::string& name) {
   return nullptr;
 }
 
+namespace {
+
+/// Rows of 4:2:2 with a whole last pair: where the width is odd, the colour that is missing is that
+/// of the pair before.
+cv::Mat wholePairs(const std::uint8_t* data, cv::Size size, std::size_t step) {
+  const cv::Mat given(size, CV_8UC2, const_cast<std::uint8_t*>(data), step);
+  if (size.width % 2 == 0) return given;
+  cv::Mat pairs(size.height, size.width + 1, CV_8UC2, cv::Scalar(128, 128));
+  given.copyTo(pairs.colRange(0, size.width));
+  if (size.width > 2) given.col(size.width - 2).copyTo(pairs.col(size.width));
+  return pairs;
+}
+
+}  // namespace
+
 cv::Mat unpack(const PixelFormat& format, const std::uint8_t* data, cv::Size size,
                std::size_t step) {
   auto* bytes = const_cast<std::uint8_t*>(data);  // cv::Mat knows no constant memory
@@ -133,11 +148,10 @@ cv::Mat unpack(const PixelFormat& format, const std::uint8_t* data, cv::Size siz
   }
   switch (format.packing) {
     case P::kYuyv:
-      cv::cvtColor(cv::Mat(size, CV_8UC2, bytes, step), out, cv::COLOR_YUV2BGR_YUYV);
-      return out;
     case P::kUyvy:
-      cv::cvtColor(cv::Mat(size, CV_8UC2, bytes, step), out, cv::COLOR_YUV2BGR_UYVY);
-      return out;
+      cv::cvtColor(wholePairs(data, size, step), out,
+                   format.packing == P::kYuyv ? cv::COLOR_YUV2BGR_YUYV : cv::COLOR_YUV2BGR_UYVY);
+      return out.colRange(0, size.width);
     case P::kUyv: {
       const cv::Mat uyv(size, CV_8UC3, bytes, step);
       cv::Mat ycrcb(size, CV_8UC3);

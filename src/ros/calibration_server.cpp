@@ -15,7 +15,7 @@
 #include "omnister/lens/lens_models.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
-#include "omnister/ros/lens_store.h"
+#include "omnister/lens/lens_store.h"
 
 namespace omnister {
 namespace {

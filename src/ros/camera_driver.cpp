@@ -176,6 +176,8 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
   }
   images_ = image_transport::ImageTransport(node_).advertiseCamera("image_raw", 4);
   set_camera_info_ = node_.advertiseService("set_camera_info", &CameraDriver::setCameraInfo, this);
+  list_lenses_ = node_.advertiseService("list_lenses", &CameraDriver::listLenses, this);
+  roll_back_lens_ = node_.advertiseService("roll_back_lens", &CameraDriver::rollBackLens, this);
   lens_subscriber_ = node_.subscribe("lens_model", 1, &CameraDriver::onLens, this);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
@@ -646,6 +648,8 @@ void CameraDriver::chooseLens() {
     }
   } catch (const std::exception& e) {
     ROS_ERROR_STREAM("starting without calibration: " << printable(e.what(), 1000));
+    const std::lock_guard<std::mutex> lock(mutex_);
+    lens_problem_ = printable(e.what(), 1000);
   }
 }
 
@@ -656,6 +660,7 @@ void CameraDriver::setLens(LensFile file) {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     lens_ = std::move(lens);
+    lens_problem_.clear();
   }
   publishLens();
 }
@@ -715,6 +720,39 @@ bool CameraDriver::setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
   return true;
 }
 
+bool CameraDriver::listLenses(ListLenses::Request&, ListLenses::Response& response) {
+  try {
+    for (const StoredLens& stored : LensStore(parameters_.store).versions(storeName())) {
+      response.versions.push_back(stored.version);
+      response.descriptions.push_back(describe(stored));
+      if (stored.current) response.current = stored.version;
+    }
+    response.success = true;
+  } catch (const std::exception& e) {
+    response.message = printable(e.what(), 1000);
+  }
+  return true;
+}
+
+bool CameraDriver::rollBackLens(RollBackLens::Request& request, RollBackLens::Response& response) {
+  try {
+    if (request.version < 0) throw InputError("roll_back_lens", "version", "is negative");
+    StoredLens stored =
+        LensStore(parameters_.store)
+            .rollBack(storeName(),
+                      request.version == 0 ? std::nullopt : std::optional<int>(request.version));
+    response.message = describe(stored);
+    response.version = stored.version;
+    setLens(std::move(*stored.file));
+    response.success = true;
+    ROS_INFO_STREAM("calibration rolled back to " << response.message);
+  } catch (const std::exception& e) {
+    response.message = printable(e.what(), 1000);
+    ROS_WARN_STREAM("roll_back_lens refused: " << response.message);
+  }
+  return true;
+}
+
 void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
   using diagnostic_msgs::DiagnosticStatus;
   const std::lock_guard<std::mutex> lock(mutex_);
@@ -732,6 +770,8 @@ void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status)
   } else if (lost > 0) {
     status.summary(DiagnosticStatus::WARN,
                    "frames get lost: " + std::to_string(lost) + " just now");
+  } else if (!lens_ && !lens_problem_.empty()) {
+    status.summary(DiagnosticStatus::WARN, "the stored calibration cannot be used");
   } else {
     status.summary(DiagnosticStatus::OK, state_);
   }
@@ -749,7 +789,7 @@ void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status)
   if (statistics_.temperature_c) status.add("temperature [C]", *statistics_.temperature_c);
   status.add("failed attempts and losses of the device", losses_of_device_);
   status.add("last problem", printable(problem_));
-  status.add("calibrated", lens_ ? "yes" : "no");
+  status.add("calibrated", lens_ ? "yes" : lens_problem_.empty() ? "no" : "no: " + lens_problem_);
 }
 
 }  // namespace omnister

@@ -7,7 +7,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <fstream>
 #include <limits>
 #include <opencv2/imgcodecs.hpp>
 #include <opencv2/imgproc.hpp>
@@ -381,18 +380,13 @@ std::unique_ptr<AtomicFile> stageCloud(const fs::path& path, const Cloud& cloud)
   checkCloud(cloud);
   const bool ply = extensionOf(path) == ".ply";
   auto file = std::make_unique<AtomicFile>(path);
-  errno = 0;
-  std::ofstream stream(file->path(), std::ios::binary);
   const cv::Size size = cloud.xyz.size();
-  const std::string header = ply ? plyHeader(size) : pcdHeader(size);
-  stream.write(header.data(), static_cast<std::streamsize>(header.size()));
-  std::vector<char> row(size.width * (ply ? kPlyVertexBytes : kPcdPointBytes));
-  for (int v = 0; v < size.height && stream; ++v) {
+  file->write(ply ? plyHeader(size) : pcdHeader(size));
+  std::string row(size.width * (ply ? kPlyVertexBytes : kPcdPointBytes), '\0');
+  for (int v = 0; v < size.height; ++v) {
     (ply ? putPlyRow : putPcdRow)(cloud, v, row.data());
-    stream.write(row.data(), static_cast<std::streamsize>(row.size()));
+    file->write(row);
   }
-  stream.close();
-  if (!stream) throw IoError("write", path.string(), errno != 0 ? errno : EIO);
   return file;
 }
 
@@ -405,12 +399,7 @@ std::unique_ptr<AtomicFile> stageRange(const fs::path& path, const cv::Mat& rang
   std::vector<uchar> bytes;
   if (!cv::imencode(".tiff", range, bytes)) throw IoError("encode", path.string(), EIO);
   auto file = std::make_unique<AtomicFile>(path);
-  errno = 0;
-  std::ofstream stream(file->path(), std::ios::binary);
-  stream.write(reinterpret_cast<const char*>(bytes.data()),
-               static_cast<std::streamsize>(bytes.size()));
-  stream.close();
-  if (!stream) throw IoError("write", path.string(), errno != 0 ? errno : EIO);
+  file->write({reinterpret_cast<const char*>(bytes.data()), bytes.size()});
   return file;
 }
 

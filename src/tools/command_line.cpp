@@ -33,6 +33,7 @@ void addEvaluate(CLI::App& app);
 void addRender(CLI::App& app);
 void addDewarp(CLI::App& app);
 void addTarget(CLI::App& app);
+void addStore(CLI::App& app);
 #ifdef OMNISTER_WITH_ROS
 void addBag(CLI::App& app);
 #endif
@@ -43,6 +44,7 @@ namespace {
 constexpr AddCommand kCommands[] = {
     addCalibrate, addCalibrateScan, addCalibrateStereo, addImport, addExport, addProject,
     addUnproject, addStereo,        addEvaluate,        addRender, addDewarp, addTarget,
+    addStore,
 #ifdef OMNISTER_WITH_ROS
     addBag,
 #endif

@@ -21,7 +21,9 @@ void omnister::fuzz::fuzzOne(std::string_view bytes) {
         pairing.reset("asked");
       } else if (operation % 2 == 0) {
         PairingFrame frame;
-        frame.stamp_ns = operation % 8 == 2 ? in.take<std::int64_t>() : now;
+        // Any stamp that a message can carry.
+        frame.stamp_ns =
+            operation % 8 == 2 ? std::int64_t{in.take<std::uint32_t>()} * 1000000000 : now;
         frame.frame_id = std::string(1, static_cast<char>('a' + operation / 128));
         frame.image = std::make_shared<int>(0);
         pairing.add(std::move(frame), now);

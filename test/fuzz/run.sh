@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# run.sh BUILD SECONDS [TARGET…]: every fuzz target for SECONDS, on all cores in turn; the corpus grows in
-# BUILD/fuzz. Prints executions by target; fails when one of them found something, which lies beside
-# the corpus then.
+# run.sh BUILD SECONDS [TARGET…]: every fuzz target for SECONDS, on all cores in turn (or JOBS of them); the
+# corpus grows in BUILD/fuzz. Prints executions by target and in all; fails when one of them found something,
+# which lies beside the corpus then.
 set -euo pipefail
 build=$1
 seconds=$2
@@ -22,11 +22,17 @@ fuzz_one() {
   mkdir -p "$folder/corpus" "$folder/found"
   local seeds
   mapfile -t seeds <"$build/tests/fuzz_$name.seeds"
-  "$build/tests/fuzz_$name" -max_total_time="$seconds" -print_final_stats=1 -timeout=25 \
+  # A finding of an earlier run must be gone.
+  if ! "$build/tests/fuzz_$name" -max_total_time="$seconds" -print_final_stats=1 -timeout=120 \
     -rss_limit_mb=3000 -max_len=16384 -verbosity=1 -artifact_prefix="$folder/found/" \
-    "$folder/corpus" "${seeds[@]}" >"$folder/log" 2>&1 || { echo "$name: FOUND, see $folder/log" && return 1; }
+    "$folder/corpus" "${seeds[@]}" "$folder/found" >"$folder/log" 2>&1; then
+    echo "$name: FOUND, see $folder/log"
+    grep -m 3 -E 'ERROR|SUMMARY|runtime error|broken:|terminate' "$folder/log" || true
+    return 1
+  fi
   awk -v name="$name" '/stat::number_of_executed_units/ {print name ": " $2 " executions"}' "$folder/log"
 }
 export -f fuzz_one
 export build seconds
-printf '%s\n' "${targets[@]}" | xargs -P "$(nproc)" -I{} bash -c 'fuzz_one {}'
+printf '%s\n' "${targets[@]}" | xargs -P "${JOBS:-$(nproc)}" -I{} bash -c 'fuzz_one {}' |
+  mawk -W interactive '{print; if (/ executions$/) sum += $2} END {print "in all: " sum " executions"}'

@@ -108,6 +108,35 @@ class CameraTest : public testing::Test {
     return file;
   }
 
+  /// The latest value of a key in the diagnostics of this camera.
+  std::string diagnosed(const Collector<diagnostic_msgs::DiagnosticArray>& diagnostics,
+                        const std::string& key) const {
+    std::string found;
+    for (const auto& array : diagnostics.messages()) {
+      for (const auto& status : array->status) {
+        if (status.hardware_id != "F-1" ||
+            status.name.find(private_.getNamespace().substr(1)) == std::string::npos) {
+          continue;
+        }
+        for (const auto& entry : status.values) {
+          if (entry.key == key) found = entry.value;
+        }
+      }
+    }
+    return found;
+  }
+
+  /// A calibration of the images above. @param f focal length [px]
+  static sensor_msgs::CameraInfo smallCamera(double f) {
+    sensor_msgs::CameraInfo info;
+    info.width = 8;
+    info.height = 6;
+    info.distortion_model = "equidistant";
+    info.D = {0.01, 0.0, 0.0, 0.0};
+    info.K = {f, 0, 3.5, 0, f, 2.5, 0, 0, 1};
+    return info;
+  }
+
   static int count_;
   ros::NodeHandle node_, private_;
   test::TemporaryFolder folder_;
@@ -212,23 +241,8 @@ TEST_F(CameraTest, DiagnosticsCountLostFrames) {
   Collector<sensor_msgs::Image> images(node_, "image_raw");
   ASSERT_TRUE(eventually([&] { return images.size() >= 3; }));
   state_.skip = 4;
-  const auto value = [&](const std::string& key) -> std::string {
-    std::string found;
-    for (const auto& array : diagnostics.messages()) {
-      for (const auto& status : array->status) {
-        if (status.hardware_id != "F-1" ||
-            status.name.find(private_.getNamespace().substr(1)) == std::string::npos) {
-          continue;
-        }
-        for (const auto& entry : status.values) {
-          if (entry.key == key) found = entry.value;
-        }
-      }
-    }
-    return found;
-  };
-  EXPECT_TRUE(eventually([&] { return value("frames lost") == "4"; }));
-  EXPECT_EQ(value("state"), "streaming");
+  EXPECT_TRUE(eventually([&] { return diagnosed(diagnostics, "frames lost") == "4"; }));
+  EXPECT_EQ(diagnosed(diagnostics, "state"), "streaming");
 }
 
 TEST_F(CameraTest, PublishesTheLensOfItsParameter) {
@@ -340,11 +354,7 @@ TEST_F(CameraTest, KeepsACalibrationThatItIsGiven) {
   ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
   sensor_msgs::SetCameraInfo call;
   sensor_msgs::CameraInfo& info = call.request.camera_info;
-  info.width = 8;
-  info.height = 6;
-  info.distortion_model = "equidistant";
-  info.D = {0.01, 0.0, 0.0, 0.0};
-  info.K = {4.0, 0, 3.5, 0, 4.0, 2.5, 0, 0, 1};
+  info = smallCamera(4.0);
   ASSERT_TRUE(ros::service::call(node_.resolveName("set_camera_info"), call));
   ASSERT_TRUE(call.response.success) << call.response.status_message;
   ASSERT_TRUE(eventually([&] { return infos.last()->K[0] != 0.0; }));
@@ -398,9 +408,55 @@ TEST_F(CameraTest, ACorruptStoreStartsUncalibrated) {
   std::filesystem::create_directories(parameters_.store);
   std::ofstream(LensStore(parameters_.store).pathOf("F-1")) << "lens_surface: {";
   openFake();
+  Collector<diagnostic_msgs::DiagnosticArray> diagnostics(ros::NodeHandle(), "/diagnostics");
   Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
   ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
   EXPECT_EQ(infos.last()->K[0], 0.0);
+  EXPECT_TRUE(eventually(
+      [&] { return diagnosed(diagnostics, "calibrated").find("F-1.yaml") != std::string::npos; }));
+  // It can be calibrated again, and what was there is kept.
+  sensor_msgs::SetCameraInfo call;
+  call.request.camera_info = smallCamera(4.0);
+  ASSERT_TRUE(ros::service::call(node_.resolveName("set_camera_info"), call));
+  ASSERT_TRUE(call.response.success) << call.response.status_message;
+  ASSERT_TRUE(eventually([&] { return infos.last()->K[0] != 0.0; }));
+  ListLenses list;
+  ASSERT_TRUE(ros::service::call(node_.resolveName("list_lenses"), list));
+  ASSERT_TRUE(list.response.success) << list.response.message;
+  EXPECT_THAT(list.response.versions, testing::ElementsAre(2, 1));
+  EXPECT_EQ(list.response.current, 2);
+  EXPECT_THAT(list.response.descriptions[1], HasSubstr("cannot be read"));
+}
+
+TEST_F(CameraTest, RollsBackToAnEarlierCalibration) {
+  openFake();
+  Collector<LensModelMessage> models(node_, "lens_model");
+  Collector<sensor_msgs::CameraInfo> infos(node_, "camera_info");
+  ASSERT_TRUE(eventually([&] { return infos.size() > 0; }));
+  for (const double f : {4.0, 5.0}) {
+    sensor_msgs::SetCameraInfo call;
+    call.request.camera_info = smallCamera(f);
+    ASSERT_TRUE(ros::service::call(node_.resolveName("set_camera_info"), call));
+    ASSERT_TRUE(call.response.success) << call.response.status_message;
+  }
+  ASSERT_TRUE(eventually([&] { return std::abs(infos.last()->K[0] - 5.0) < 0.1; }));
+  RollBackLens back;
+  ASSERT_TRUE(ros::service::call(node_.resolveName("roll_back_lens"), back));
+  ASSERT_TRUE(back.response.success) << back.response.message;
+  EXPECT_EQ(back.response.version, 1);
+  ASSERT_TRUE(eventually([&] { return std::abs(infos.last()->K[0] - 4.0) < 0.1; }));
+  EXPECT_TRUE(eventually([&] { return models.size() == 3; }));
+  // There is nothing before the first, and no such version.
+  for (const int version : {0, 7, -1}) {
+    back.request.version = version;
+    ASSERT_TRUE(ros::service::call(node_.resolveName("roll_back_lens"), back));
+    EXPECT_FALSE(back.response.success) << version;
+    EXPECT_NE(back.response.message, "");
+  }
+  back.request.version = 2;
+  ASSERT_TRUE(ros::service::call(node_.resolveName("roll_back_lens"), back));
+  EXPECT_TRUE(back.response.success) << back.response.message;
+  ASSERT_TRUE(eventually([&] { return std::abs(infos.last()->K[0] - 5.0) < 0.1; }));
 }
 
 TEST_F(CameraTest, ARecordedStageIsPublishedBesideItsImages) {
@@ -460,26 +516,6 @@ TEST_F(CameraTest, RefusesParametersByKeyValueAndRange) {
   EXPECT_THAT(refusal("axis", "0 0 0"), HasSubstr("axis"));
   EXPECT_THAT(refusal("camera_info_url", "http://there"), HasSubstr("camera_info_url"));
   EXPECT_EQ(refusal("camera_info_url", "file:///there.yaml"), "");
-}
-
-TEST_F(CameraTest, TheStoreNeverLeavesItsFolder) {
-  const LensStore store(parameters_.store);
-  for (const char* name : {"..", "../x", "a/b", "/etc/passwd", "", ".hidden", "a b", "a\nb"}) {
-    EXPECT_THROW(store.save(name, lens()), InputError) << name;
-    EXPECT_THROW(store.load(name), InputError) << name;
-  }
-  EXPECT_EQ(store.load("none"), std::nullopt);
-  store.save("a-1", lens());
-  store.save("a-1", lens());
-  EXPECT_TRUE(store.load("a-1"));
-  EXPECT_TRUE(std::filesystem::exists(store.folder() / "a-1.yaml~"));
-  std::filesystem::create_symlink(folder_.path() / "outside.yaml", store.folder() / "link.yaml");
-  EXPECT_THROW(store.save("link", lens()), InputError);
-  EXPECT_THROW(store.load("link"), InputError);
-  EXPECT_FALSE(std::filesystem::exists(folder_.path() / "outside.yaml"));
-  EXPECT_EQ(LensStore::nameFrom("Basler (A/1)"), "Basler__A_1_");
-  EXPECT_NO_THROW(store.pathOf(LensStore::nameFrom("../../x")));
-  EXPECT_NO_THROW(store.pathOf(LensStore::nameFrom("")));
 }
 
 }  // namespace

@@ -9,7 +9,8 @@
 /// someone listens, and is opened again when it was lost: the same camera, with the settings it
 /// had. What can change while it streams is changed by dynamic_reconfigure; `trigger` exposes once.
 /// A recording that knows stage positions also publishes `stage_state` and the stage's tf. What
-/// `set_camera_info` is given is kept in the store, as a lens surface.
+/// `set_camera_info` is given is kept in the store, as a lens surface; `list_lenses` tells what the
+/// store keeps, and `roll_back_lens` makes an earlier one current.
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
@@ -32,11 +33,13 @@
 #include <thread>
 
 #include "omnister/CameraConfig.h"
+#include "omnister/ListLenses.h"
+#include "omnister/RollBackLens.h"
 #include "omnister/common/pose.h"
 #include "omnister/device/camera.h"
 #include "omnister/lens/lens_file.h"
+#include "omnister/lens/lens_store.h"
 #include "omnister/ros/callback_threads.h"
-#include "omnister/ros/lens_store.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/static_frames.h"
 
@@ -125,6 +128,8 @@ class CameraDriver {
   void onLens(const LensModelMessage::ConstPtr& message);
   bool setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
                      sensor_msgs::SetCameraInfo::Response& response);
+  bool listLenses(ListLenses::Request& request, ListLenses::Response& response);
+  bool rollBackLens(RollBackLens::Request& request, RollBackLens::Response& response);
   std::string storeName() const;
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
@@ -139,6 +144,7 @@ class CameraDriver {
   std::shared_ptr<const Lens> lens_;
   std::optional<device::SensorRegion> region_;  // of the last frame
   std::string published_lens_;
+  std::string lens_problem_;  // why there is none, where the store holds one
   device::CameraIdentity identity_;
   std::string state_ = "opening";
   std::string problem_;
@@ -178,6 +184,8 @@ class CameraDriver {
   ros::Publisher stage_publisher_;
   ros::Subscriber lens_subscriber_;
   ros::ServiceServer set_camera_info_;
+  ros::ServiceServer list_lenses_;
+  ros::ServiceServer roll_back_lens_;
   ros::ServiceServer trigger_;
   ros::NodeHandle private_node_;
   boost::recursive_mutex config_mutex_;

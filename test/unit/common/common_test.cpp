@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <fcntl.h>
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 #include <sys/stat.h>
@@ -96,10 +97,40 @@ TEST_F(FileIo, FollowsALinkAndKeepsTheMode) {
 TEST_F(FileIo, AnAtomicFileThatIsNotCommittedVanishes) {
   {
     AtomicFile file(folder_ / "image.tiff");
-    EXPECT_EQ(file.path().extension(), ".tiff");
-    std::ofstream(file.path()) << "half";
+    file.write("half");
   }
   EXPECT_EQ(entries(), 0u);
+}
+
+TEST_F(FileIo, DevicesAndPipesAreWrittenToAndNotReplaced) {
+  writeFileAtomically("/dev/null", "gone");
+  EXPECT_THROW(writeFileAtomically("/dev/full", "no room"), IoError);
+  for (const char* device : {"/dev/null", "/dev/full"})
+    EXPECT_EQ(fs::status(device).type(), fs::file_type::character) << device;
+  const fs::path pipe = folder_ / "pipe";
+  ASSERT_EQ(::mkfifo(pipe.c_str(), 0600), 0);
+  EXPECT_THROW(writeFileAtomically(pipe, "nobody reads"), IoError);
+  EXPECT_THROW(readFile(pipe), InputError);
+  const int reader = ::open(pipe.c_str(), O_RDONLY | O_NONBLOCK);
+  writeFileAtomically(pipe, "read");
+  char buffer[8] = {};
+  EXPECT_EQ(::read(reader, buffer, sizeof buffer), 4);
+  ::close(reader);
+  EXPECT_STREQ(buffer, "read");
+  EXPECT_EQ(fs::status(pipe).type(), fs::file_type::fifo);
+  EXPECT_EQ(entries(), 1u);
+}
+
+TEST_F(FileIo, ANewFileReplacesNone) {
+  AtomicFile first(folder_ / "file"), second(folder_ / "file");
+  first.write("first");
+  second.write("second");
+  EXPECT_TRUE(first.commitNew());
+  EXPECT_FALSE(second.commitNew());
+  EXPECT_EQ(readFile(folder_ / "file"), "first");
+  second.commit();
+  EXPECT_EQ(readFile(folder_ / "file"), "second");
+  EXPECT_EQ(entries(), 1u);
 }
 
 TEST(ParallelFor, VisitsEveryIndexOnce) {
