@@ -45,7 +45,7 @@ std::string mutate(const std::vector<std::string>& seeds, std::mt19937& random) 
         break;
       case 4: {
         const std::string& other = seeds[below(seeds.size())];
-        text = text.substr(0, at) + other.substr(below(other.size() + 1));
+        text.replace(at, std::string::npos, other, below(other.size() + 1));
         break;
       }
       default:
