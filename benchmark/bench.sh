@@ -4,7 +4,7 @@ set -euo pipefail
 
 usage() {
   cat <<'TXT'
-./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling | camera [OPTION…]]
+./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling | camera | calibration [OPTION…]]
 
   parts      Google Benchmark: lenses, renderer, views, the sweep
   compare    the sweep beside OpenCV's matchers on the same rendered pair, at 1280x960 and 3060x2036,
@@ -12,8 +12,10 @@ usage() {
   accuracy   errors of the sweep by field angle on further scenes; phase bias; more than two positions
   scaling    cost by pixels, hypotheses, positions and threads, with a plot
   camera     processor time of the camera driver beside a bare Aravis loop, on Debian's software camera
+  calibration  lenses, calibration and detection beside the limits that they are held to; names choose
+             among them (recorded corners lenses simulation stage time detection scan)
 
-Without a name: all of them. Options after a name go to it (`./run bench compare --help`). --quick: fewer
+Without a name: all but calibration. Options after a name go to it (`./run bench compare --help`). --quick: fewer
 runs and the small size only. Results go to DIR too (JSON, CSV, SVG). OMNISTER_SIMD=avx2 or scalar holds
 the sweep to narrower registers.
 TXT
@@ -55,6 +57,7 @@ compare() {
 
 # 77: there is no camera to measure on.
 camera() { /usr/bin/python3 "$here/camera_cost.py" "$@" || [ $? -eq 77 ]; }
+calibration() { omnister_bench_calibration ${out:+--out "$out"} "$@"; }
 
 case "$part" in
   all)
@@ -69,6 +72,7 @@ case "$part" in
   accuracy) stereo --suite accuracy "$@" ;;
   scaling) stereo --suite scaling "$@" ;;
   camera) camera "$@" ;;
+  calibration) calibration "$@" ;;
   *)
     usage >&2
     exit 2

@@ -8,6 +8,7 @@
 
 #include "corner_refinement.h"
 #include "omnister/calibration/target.h"
+#include "point_refinement.h"
 
 namespace omnister::detect {
 
@@ -35,10 +36,22 @@ std::vector<Corner> detectCheckerboard(const GrayImage& image, const Target& tar
 std::optional<cv::Size> checkerboardSize(const GrayImage& image);
 std::vector<Corner> detectCircles(const GrayImage& image, const Target& target,
                                   const Budget& budget);
+/// Columns and rows of whatever grid of dots is seen, symmetric or not as `like` is.
+std::optional<cv::Size> circlesSize(const GrayImage& image, const Target& like,
+                                    const Budget& budget);
 std::vector<Corner> detectCharuco(const GrayImage& image, const Target& target,
                                   const Budget& budget);
 std::vector<Corner> detectAprilGrid(const GrayImage& image, const Target& target,
                                     const Budget& budget);
+
+/// Markers of a board's dictionary, wherever they are: `id` and `pixels` alone.
+std::vector<Marker> decodeCharuco(const GrayImage& image, const Target& target,
+                                  const Budget& budget);
+std::vector<Marker> decodeAprilGrid(const GrayImage& image, const Target& target,
+                                    const Budget& budget);
+/// Their places on the board; those that it does not have are dropped.
+std::vector<Marker> placeCharuco(const std::vector<Marker>& decoded, const Target& target);
+std::vector<Marker> placeAprilGrid(const std::vector<Marker>& decoded, const Target& target);
 
 /// A copy of the image with at most `max_pixels`, and how pixels of the copy map back.
 struct ScaledImage {

@@ -4,8 +4,6 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
-#include <cstdio>
-#include <ctime>
 #include <map>
 
 #include "mono.h"
@@ -13,6 +11,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
 #include "omnister/common/parallel.h"
+#include "omnister/common/text.h"
 #include "stage.h"
 
 namespace omnister {
@@ -30,12 +29,6 @@ constexpr double kSamePx = 2e-5;
 constexpr std::size_t kManyCorners = 8000;
 /// With fewer corners a grid of corrections only follows the noise.
 constexpr std::size_t kGridCorners = 3000;
-
-std::string fixed(double value, int digits) {
-  char text[64];
-  std::snprintf(text, sizeof text, "%.*f", digits, value);
-  return text;
-}
 
 std::string joined(const std::vector<std::string>& parts, std::size_t limit = 8) {
   std::string text;
@@ -63,15 +56,6 @@ double tilt(const Pose& T_camera_plane) {
 }
 
 }  // namespace
-
-std::string currentDate() {
-  const std::time_t now = std::time(nullptr);
-  std::tm utc{};
-  gmtime_r(&now, &utc);
-  char text[32];
-  std::strftime(text, sizeof text, "%Y-%m-%dT%H:%M:%SZ", &utc);
-  return text;
-}
 
 Prepared prepareViews(const Detections& detections, bool warp, const Board* board) {
   if (detections.image_size.width <= 0 || detections.image_size.height <= 0) {
@@ -172,8 +156,8 @@ Fit trustedFirstFit(Prepared& prepared, int threads) {
     if (lost[i]) {
       reason = "no pose of the board explains its corners";
     } else if (medians[i] > 8.0 * typical + 2.0) {
-      reason = "its corners are " + fixed(medians[i], 1) +
-               " px off a lens that the others agree on (" + fixed(typical, 2) + " px)";
+      reason = "its corners are " + formatFixed(medians[i], 1) +
+               " px off a lens that the others agree on (" + formatFixed(typical, 2) + " px)";
     } else if (sides[i] * seen_from_front < 0.0) {
       reason = "its corners are mirrored against those of the other views";
     }
@@ -199,7 +183,7 @@ Fit trustedFirstFit(Prepared& prepared, int threads) {
   const double median = statisticsOf(residualsOf(input, fit.state)).median_px;
   if (!(median < 5e-3 * diagonal)) {
     throw Error(
-        "no lens explains the corners: the best is " + fixed(median, 1) +
+        "no lens explains the corners: the best is " + formatFixed(median, 1) +
         " px off for half of them; check that the board coordinates are those of this board and "
         "that all views are from one camera at one focal length");
   }
@@ -486,15 +470,15 @@ void refuseUndetermined(const FitInput& input, const BundleState& state, const L
   const double covered =
       (high_x - low_x) * (high_y - low_y) / (1.0 * image_size.width * image_size.height);
   const std::string verdict = "the views do not determine the lens (projection uncertain by " +
-                              fixed(field.rms_px, 1) + " px): ";
+                              formatFixed(field.rms_px, 1) + " px): ";
   if (all_square || degrees(largest) < 10.0) {
     throw Error(
         verdict + "every board is square to the optical axis (largest tilt " +
-        fixed(degrees(largest), 1) +
+        formatFixed(degrees(largest), 1) +
         " degrees), which leaves the scale of the lens open; tilt some by 20 degrees or more");
   }
   if (covered < 0.15) {
-    throw Error(verdict + "the corners cover only " + fixed(100.0 * covered, 0) +
+    throw Error(verdict + "the corners cover only " + formatFixed(100.0 * covered, 0) +
                 " % of the image; show the board in all of it");
   }
   throw Error(verdict +
@@ -615,8 +599,8 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
                       [&](const auto& residual) { return residual.norm() > outlier_limit; });
     if (view_rms[i] > 3.0 * typical + 0.02 && far * 4 >= static_cast<long>(residuals[i].size())) {
       result.warnings.push_back("view '" + input.names[i] +
-                                "' fits badly: " + fixed(view_rms[i], 2) + " px where " +
-                                fixed(typical, 2) + " px is typical");
+                                "' fits badly: " + formatFixed(view_rms[i], 2) + " px where " +
+                                formatFixed(typical, 2) + " px is typical");
     } else if (far > 0) {
       outliers.push_back("'" + input.names[i] + "' (" + std::to_string(far) + ")");
     }
@@ -625,7 +609,7 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
   if (!outliers.empty()) {
     result.warnings.push_back(std::to_string(outlier_count) + " of " +
                               std::to_string(result.points) + " corners lie more than " +
-                              fixed(outlier_limit, 2) + " px off and hardly count: views " +
+                              formatFixed(outlier_limit, 2) + " px off and hardly count: views " +
                               joined(outliers));
   }
   const LensPtr lens = fit.state.lenses[0];
@@ -635,8 +619,8 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
 
   const ProjectionField uncertainty = projectionUncertainty(*lens, covariance, input.image_size);
   auto& notes = result.file.calibration.notes;
-  notes["uncertainty_rms_px"] = fixed(uncertainty.rms_px, 4);
-  notes["uncertainty_max_px"] = fixed(uncertainty.max_px, 4);
+  notes["uncertainty_rms_px"] = formatFixed(uncertainty.rms_px, 4);
+  notes["uncertainty_max_px"] = formatFixed(uncertainty.max_px, 4);
   result.uncertainty_rms_px = uncertainty.rms_px;
   result.uncertainty_max_px = uncertainty.max_px;
   std::vector<double> distances;
@@ -656,7 +640,7 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
   }
   if (uncertainty.rms_px > 1.0) {
     result.warnings.push_back(
-        "the projection is uncertain by " + fixed(uncertainty.rms_px, 1) +
+        "the projection is uncertain by " + formatFixed(uncertainty.rms_px, 1) +
         " px: add views with the board tilted, and in all parts of the image");
   }
   if (richer) {
@@ -664,13 +648,13 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
         projectionDifference(*lens, *richer->state.lenses[0], input.image_size);
     result.bias_rms_px = bias.rms_px;
     result.bias_against = describeStructure(richer->structure);
-    notes["bias_rms_px"] = fixed(bias.rms_px, 4);
+    notes["bias_rms_px"] = formatFixed(bias.rms_px, 4);
     notes["bias_against"] = result.bias_against;
     if (bias.rms_px > 2.0 * uncertainty.rms_px + 1e-3) {
       result.warnings.push_back(
           "the model's bias exceeds its uncertainty: " + describeStructure(richer->structure) +
-          " differs by " + fixed(bias.rms_px, 3) + " px RMS, noise explains " +
-          fixed(uncertainty.rms_px, 3) + " px");
+          " differs by " + formatFixed(bias.rms_px, 3) + " px RMS, noise explains " +
+          formatFixed(uncertainty.rms_px, 3) + " px");
     }
   }
   notes["structure"] = describeStructure(fit.structure);

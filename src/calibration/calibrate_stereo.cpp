@@ -20,12 +20,6 @@ using namespace calibration;
 /// Pairs needed to tell a rigid pose from chance.
 constexpr std::size_t kFewestPairs = 3;
 
-std::string fixed(double value, int digits) {
-  char text[64];
-  std::snprintf(text, sizeof text, "%.*f", digits, value);
-  return text;
-}
-
 double median(std::vector<double> values) {
   const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
   std::nth_element(values.begin(), middle, values.end());
@@ -65,7 +59,8 @@ Single fitAlone(const Detections& detections, const Board& board, const Calibrat
       if (bias > 2.0 * noise + 1e-3) {
         single.bias_warning =
             "the model's bias exceeds its uncertainty: " + describeStructure(richer->structure) +
-            " differs by " + fixed(bias, 3) + " px RMS, noise explains " + fixed(noise, 3) + " px";
+            " differs by " + formatFixed(bias, 3) + " px RMS, noise explains " +
+            formatFixed(noise, 3) + " px";
       }
     }
     return single;
@@ -235,10 +230,10 @@ StereoCalibrationResult calibrateStereo(const Detections& left, const Detections
       const double limit = (round == 0 ? 4.0 : 2.5) * typical + 0.02;
       used[i] = pair_rms[i] <= limit;
       reasons[i] = used[i] ? ""
-                           : "the pair is " + fixed(pair_rms[i], 2) +
+                           : "the pair is " + formatFixed(pair_rms[i], 2) +
                                  " px off the pose between the "
                                  "cameras that the others agree on (" +
-                                 fixed(typical, 2) + " px)";
+                                 formatFixed(typical, 2) + " px)";
     }
     const auto kept =
         std::count(used.begin(), used.begin() + static_cast<std::ptrdiff_t>(pairs.size()), true);
@@ -257,8 +252,8 @@ StereoCalibrationResult calibrateStereo(const Detections& left, const Detections
   const double typical_pair = median(pair_rms);
   if (typical_pair > 5.0 * alone + 1.0) {
     throw Error("no pairs agree on one pose between the cameras: together they fit to " +
-                fixed(typical_pair, 1) + " px, each camera by itself to " + fixed(alone, 2) +
-                " px; are left and right images in the same order?");
+                formatFixed(typical_pair, 1) + " px, each camera by itself to " +
+                formatFixed(alone, 2) + " px; are left and right images in the same order?");
   }
 
   // Either camera's result, with the joint figures.
@@ -379,7 +374,7 @@ StereoCalibrationResult calibrateStereo(const Detections& left, const Detections
   }
   if (sigma > 1.5 * alone + 0.01) {
     result.warnings.push_back(
-        "the cameras together fit " + fixed(sigma / std::max(alone, 1e-6), 1) +
+        "the cameras together fit " + formatFixed(sigma / std::max(alone, 1e-6), 1) +
         " times worse than each by itself: the rig is not quite rigid, or the "
         "images of a pair are not of one instant");
   }

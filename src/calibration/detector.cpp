@@ -66,12 +66,6 @@ std::optional<ViewDetections> detectTarget(const cv::Mat& image, const Target& t
   return view;
 }
 
-std::optional<cv::Size> checkerboardSize(const cv::Mat& image) {
-  const detect::GrayImage gray = detect::toGray(image);
-  if (gray.eight_bit.empty()) return std::nullopt;
-  return detect::checkerboardSize(gray);
-}
-
 Detections detectInFiles(const std::vector<std::string>& image_files, const Target& target,
                          const DetectorOptions& options, std::vector<std::string>* missed,
                          const Progress& progress) {

@@ -16,6 +16,7 @@
 namespace omnister::detect {
 namespace {
 
+/// Numbers and corners of the tags; where they belong is for placeAprilGrid().
 std::vector<Marker> findTags(const cv::Mat& image, const Target& target, double scale, int widen) {
   const ScaledImage copy = scaled(image, scale);
   cv::Mat searched;
@@ -35,14 +36,12 @@ std::vector<Marker> findTags(const cv::Mat& image, const Target& target, double 
   const std::unique_ptr<zarray_t, void (*)(zarray_t*)> detections(
       apriltag_detector_detect(detector.get(), &view), apriltag_detections_destroy);
   std::vector<Marker> markers;
-  const double pitch = target.square_m * (1.0 + target.spacing);
   for (int i = 0; i < zarray_size(detections.get()); ++i) {
     apriltag_detection_t* detection = nullptr;
     zarray_get(detections.get(), i, &detection);
-    if (detection->id >= target.cols * target.rows || detection->decision_margin < 15.0f) continue;
+    if (detection->decision_margin < 15.0f) continue;
     Marker marker;
     marker.id = detection->id;
-    marker.cell = {detection->id % target.cols, target.rows - 1 - detection->id / target.cols};
     // The library goes round from the bottom left and counts pixels from their edges.
     for (const int k : {3, 2, 1, 0}) {
       const cv::Point2f pixel = copy.toOriginal({static_cast<float>(detection->p[k][0] - 0.5),
@@ -56,10 +55,6 @@ std::vector<Marker> findTags(const cv::Mat& image, const Target& target, double 
         pixel += (pixel - middle).normalized() * (std::sqrt(2.0) * widen / scale);
       }
     }
-    const Eigen::Vector2d corner(marker.cell.x() * pitch, marker.cell.y() * pitch);
-    for (const auto& [right, down] : {std::pair{0, 0}, {1, 0}, {1, 1}, {0, 1}}) {
-      marker.board.push_back(corner + target.square_m * Eigen::Vector2d(right, down));
-    }
     markers.push_back(marker);
   }
   return markers;
@@ -67,7 +62,7 @@ std::vector<Marker> findTags(const cv::Mat& image, const Target& target, double 
 
 }  // namespace
 
-std::vector<Corner> detectAprilGrid(const GrayImage& image, const Target& target,
+std::vector<Marker> decodeAprilGrid(const GrayImage& image, const Target& target,
                                     const Budget& budget) {
   const double pixels = static_cast<double>(image.eight_bit.total());
   const double fitting = std::min(1.0, std::sqrt(4e6 / pixels));
@@ -84,17 +79,35 @@ std::vector<Corner> detectAprilGrid(const GrayImage& image, const Target& target
   std::vector<Marker> markers;
   const std::size_t all = static_cast<std::size_t>(target.cols) * target.rows;
   for (const Attempt& attempt : attempts) {
-    if (budget.spent() || markers.size() == all) break;
-    for (const Marker& marker : findTags(image.eight_bit, target, attempt.scale, attempt.widen)) {
-      const bool known = std::any_of(markers.begin(), markers.end(),
-                                     [&](const Marker& other) { return other.id == marker.id; });
-      if (!known) markers.push_back(marker);
-    }
+    if (budget.spent() || markers.size() >= all) break;
+    addNew(findTags(image.eight_bit, target, attempt.scale, attempt.widen), markers);
   }
-  markers = consistentMarkers(markers);
+  return markers;
+}
+
+std::vector<Marker> placeAprilGrid(const std::vector<Marker>& decoded, const Target& target) {
+  const double pitch = target.square_m * (1.0 + target.spacing);
+  std::vector<Marker> markers;
+  for (Marker marker : decoded) {
+    if (marker.id < 0 || marker.id >= target.cols * target.rows) continue;
+    marker.cell = {marker.id % target.cols, target.rows - 1 - marker.id / target.cols};
+    const Eigen::Vector2d corner(marker.cell.x() * pitch, marker.cell.y() * pitch);
+    marker.board.clear();
+    for (const auto& [right, down] : {std::pair{0, 0}, {1, 0}, {1, 1}, {0, 1}}) {
+      marker.board.push_back(corner + target.square_m * Eigen::Vector2d(right, down));
+    }
+    markers.push_back(std::move(marker));
+  }
+  return markers;
+}
+
+std::vector<Corner> detectAprilGrid(const GrayImage& image, const Target& target,
+                                    const Budget& budget) {
+  const std::vector<Marker> markers =
+      consistentMarkers(placeAprilGrid(decodeAprilGrid(image, target, budget), target));
 
   const int points_a_row = 2 * target.cols;
-  Expected expected(4 * all);
+  Expected expected(4 * static_cast<std::size_t>(target.cols) * target.rows);
   for (const Marker& marker : markers) {
     const int first = 2 * marker.cell.y() * points_a_row + 2 * marker.cell.x();
     const int ids[4] = {first, first + 1, first + points_a_row + 1, first + points_a_row};

@@ -13,6 +13,7 @@
 namespace omnister::detect {
 namespace {
 
+/// Numbers and corners of the markers; where they belong is for placeCharuco().
 std::vector<Marker> findMarkers(const cv::Mat& image, const Target& target, double scale) {
   const ScaledImage copy = scaled(image, scale);
   auto parameters = cv::aruco::DetectorParameters::create();
@@ -33,20 +34,10 @@ std::vector<Marker> findMarkers(const cv::Mat& image, const Target& target, doub
   } catch (const cv::Exception&) {
     return {};  // asserts on images too small for its filters
   }
-  const auto cells = tags::charucoMarkers(target);
-  const double side = target.square_m;
-  const double inset = 0.5 * (side - target.marker_m);
   std::vector<Marker> markers;
   for (std::size_t i = 0; i < ids.size(); ++i) {
-    if (ids[i] < 0 || ids[i] >= static_cast<int>(cells.size())) continue;
     Marker marker;
     marker.id = ids[i];
-    marker.cell = cells[ids[i]];
-    const Eigen::Vector2d corner(marker.cell.x() * side - side + inset,
-                                 marker.cell.y() * side - side + inset);
-    for (const auto& [right, down] : {std::pair{0, 0}, {1, 0}, {1, 1}, {0, 1}}) {
-      marker.board.push_back(corner + target.marker_m * Eigen::Vector2d(right, down));
-    }
     for (const cv::Point2f& quad : quads[i]) {
       const cv::Point2f pixel = copy.toOriginal(quad);
       marker.pixels.emplace_back(pixel.x, pixel.y);
@@ -83,7 +74,7 @@ void extrapolate(const Measured& measured, const Target& target, Expected& expec
 
 }  // namespace
 
-std::vector<Corner> detectCharuco(const GrayImage& image, const Target& target,
+std::vector<Marker> decodeCharuco(const GrayImage& image, const Target& target,
                                   const Budget& budget) {
   const double pixels = static_cast<double>(image.eight_bit.total());
   std::vector<Marker> markers;
@@ -93,14 +84,35 @@ std::vector<Corner> detectCharuco(const GrayImage& image, const Target& target,
   for (const double scale : {fitting, 0.5 * fitting, 2.0}) {
     const bool enlarged = scale > 1.0;
     const std::size_t all = tags::charucoMarkers(target).size();
-    if (budget.spent() || markers.size() == all || (enlarged && pixels > 2e6)) break;
-    for (const Marker& marker : findMarkers(image.eight_bit, target, scale)) {
-      const bool known = std::any_of(markers.begin(), markers.end(),
-                                     [&](const Marker& other) { return other.id == marker.id; });
-      if (!known) markers.push_back(marker);
-    }
+    if (budget.spent() || markers.size() >= all || (enlarged && pixels > 2e6)) break;
+    addNew(findMarkers(image.eight_bit, target, scale), markers);
   }
-  markers = consistentMarkers(markers);
+  return markers;
+}
+
+std::vector<Marker> placeCharuco(const std::vector<Marker>& decoded, const Target& target) {
+  const auto cells = tags::charucoMarkers(target);
+  const double side = target.square_m;
+  const double inset = 0.5 * (side - target.marker_m);
+  std::vector<Marker> markers;
+  for (Marker marker : decoded) {
+    if (marker.id < 0 || marker.id >= static_cast<int>(cells.size())) continue;
+    marker.cell = cells[static_cast<std::size_t>(marker.id)];
+    const Eigen::Vector2d corner(marker.cell.x() * side - side + inset,
+                                 marker.cell.y() * side - side + inset);
+    marker.board.clear();
+    for (const auto& [right, down] : {std::pair{0, 0}, {1, 0}, {1, 1}, {0, 1}}) {
+      marker.board.push_back(corner + target.marker_m * Eigen::Vector2d(right, down));
+    }
+    markers.push_back(std::move(marker));
+  }
+  return markers;
+}
+
+std::vector<Corner> detectCharuco(const GrayImage& image, const Target& target,
+                                  const Budget& budget) {
+  const std::vector<Marker> markers =
+      consistentMarkers(placeCharuco(decodeCharuco(image, target, budget), target));
 
   const std::vector<Eigen::Vector3d> board = targetPoints(target);
   Expected expected(board.size());

@@ -120,50 +120,128 @@ std::vector<std::size_t> findGrid(const std::vector<cv::Point2f>& dots, const Ta
   return indices;
 }
 
+// The dots of the grid, row by row in the order of the target, in pixels of the whole image;
+// nothing where they are not there.
+std::optional<std::vector<cv::Point2f>> gridOfDots(const ScaledImage& copy,
+                                                   const std::vector<cv::Point2f>& dots,
+                                                   const Target& target, const Budget& budget,
+                                                   const std::vector<double>& half_fields,
+                                                   std::size_t* next) {
+  const int grid = target.asymmetric ? cv::CALIB_CB_ASYMMETRIC_GRID : cv::CALIB_CB_SYMMETRIC_GRID;
+  constexpr int kMethods[] = {0, static_cast<int>(cv::CALIB_CB_CLUSTERING)};
+  while (*next < 2 * half_fields.size() && !budget.spent()) {
+    const double half_field = half_fields[*next / 2];
+    const int method = kMethods[*next % 2];
+    ++*next;
+    const auto seen =
+        half_field > 0.0 ? flattened(dots, copy.image.size(), half_field) : std::optional(dots);
+    if (!seen) continue;
+    std::vector<cv::Point2f> centres;
+    for (const std::size_t index : findGrid(*seen, target, grid | method)) {
+      centres.push_back(copy.toOriginal(dots[index]));
+    }
+    if (centres.empty()) continue;
+    if (auto ordered = orderDots(centres, target)) return ordered;
+  }
+  return std::nullopt;
+}
+
+// Whether the rows or columns go on beside the grid: then it is part of a larger board, and which
+// part nothing tells.
+bool goesOn(const std::vector<cv::Point2f>& grid, const Target& target,
+            const std::vector<cv::Point2f>& dots) {
+  const int cols = target.cols;
+  const int rows = target.rows;
+  const auto at = [&](int col, int row) { return grid[row * cols + col]; };
+  // A dot near where the step from `inner` to `edge`, taken from `from`, leads.
+  const auto follows = [&](cv::Point2f from, cv::Point2f edge, cv::Point2f inner) {
+    const cv::Point2f next = from + (edge - inner);
+    const double near = 0.3 * cv::norm(next - edge);
+    return std::any_of(dots.begin(), dots.end(),
+                       [&](const cv::Point2f& dot) { return cv::norm(dot - next) < near; });
+  };
+  // Rows of an asymmetric grid repeat every other.
+  const int shift = target.asymmetric ? 1 : 0;
+  int counts[4] = {0, 0, 0, 0};
+  for (int col = 0; col < cols; ++col) {
+    counts[0] += follows(at(col, shift), at(col, 0), at(col, 1 + shift));
+    counts[1] += follows(at(col, rows - 1 - shift), at(col, rows - 1), at(col, rows - 2 - shift));
+  }
+  for (int row = 0; row < rows; ++row) {
+    counts[2] += follows(at(0, row), at(0, row), at(1, row));
+    counts[3] += follows(at(cols - 1, row), at(cols - 1, row), at(cols - 2, row));
+  }
+  return 3 * std::max(counts[0], counts[1]) >= 2 * cols ||
+         3 * std::max(counts[2], counts[3]) >= 2 * rows;
+}
+
+// Half fields over the longer side to undo, 0 for the dots as they are.
+const std::vector<double> kHalfFields = {0.0, 1.6, 1.2, 0.8};
+
+std::vector<double> searchScales(const cv::Mat& image) {
+  std::vector<double> scales;
+  for (const double pixels : {0.5e6, 1.6e6, 0.2e6, 4e6}) {
+    const double scale = std::min(1.0, std::sqrt(pixels / static_cast<double>(image.total())));
+    if (std::find(scales.begin(), scales.end(), scale) == scales.end()) scales.push_back(scale);
+  }
+  return scales;
+}
+
 }  // namespace
 
 std::vector<Corner> detectCircles(const GrayImage& image, const Target& target,
                                   const Budget& budget) {
   const std::size_t expected_dots = static_cast<std::size_t>(target.cols) * target.rows;
-  std::vector<double> scales;
-  for (const double pixels : {0.5e6, 1.6e6, 0.2e6, 4e6}) {
-    const double scale =
-        std::min(1.0, std::sqrt(pixels / static_cast<double>(image.eight_bit.total())));
-    if (std::find(scales.begin(), scales.end(), scale) == scales.end()) scales.push_back(scale);
-  }
-  for (const double scale : scales) {
+  for (const double scale : searchScales(image.eight_bit)) {
     if (budget.spent()) break;
     const ScaledImage copy = scaled(image.eight_bit, scale);
     const std::vector<cv::Point2f> dots = findDots(copy.image);
     // The finder's time grows with a high power of the number of dots.
     if (dots.size() < expected_dots || dots.size() > 4 * expected_dots + 100) continue;
-    const int grid = target.asymmetric ? cv::CALIB_CB_ASYMMETRIC_GRID : cv::CALIB_CB_SYMMETRIC_GRID;
-    // Half fields over the longer side, 0 for the dots as they are.
-    for (const double half_field : {0.0, 1.6, 1.2, 0.8}) {
-      const auto seen =
-          half_field > 0.0 ? flattened(dots, copy.image.size(), half_field) : std::optional(dots);
-      if (!seen) continue;
-      for (const int method : {0, static_cast<int>(cv::CALIB_CB_CLUSTERING)}) {
-        if (budget.spent()) break;
-        std::vector<cv::Point2f> centres;
-        for (const std::size_t index : findGrid(*seen, target, grid | method)) {
-          centres.push_back(copy.toOriginal(dots[index]));
-        }
-        if (centres.size() != expected_dots) continue;
-        const auto ordered = orderDots(centres, target);
-        if (!ordered) continue;
-        Measured coarse;
-        for (const cv::Point2f& c : *ordered) coarse.emplace_back(Eigen::Vector2d(c.x, c.y));
-        const Measured measured = measurePoints(image.fine, target, framesFromGrid(coarse, target));
-        std::vector<Corner> corners;
-        for (std::size_t id = 0; id < measured.size(); ++id) {
-          if (measured[id]) corners.push_back({static_cast<int>(id), *measured[id]});
-        }
-        if (10 * corners.size() >= 9 * expected_dots) return corners;
+    std::vector<cv::Point2f> seen;
+    for (const cv::Point2f& dot : dots) seen.push_back(copy.toOriginal(dot));
+    std::size_t next = 0;
+    while (const auto ordered = gridOfDots(copy, dots, target, budget, kHalfFields, &next)) {
+      if (goesOn(*ordered, target, seen)) return {};
+      Measured coarse;
+      for (const cv::Point2f& c : *ordered) coarse.emplace_back(Eigen::Vector2d(c.x, c.y));
+      const Measured measured = measurePoints(image.fine, target, framesFromGrid(coarse, target));
+      std::vector<Corner> corners;
+      for (std::size_t id = 0; id < measured.size(); ++id) {
+        if (measured[id]) corners.push_back({static_cast<int>(id), *measured[id]});
       }
+      if (10 * corners.size() >= 9 * expected_dots) return corners;
     }
   }
   return {};
+}
+
+std::optional<cv::Size> circlesSize(const GrayImage& image, const Target& like,
+                                    const Budget& budget) {
+  constexpr int kLeast = 3;
+  constexpr int kStray = 3;  // dots beside the board
+  for (const double scale : searchScales(image.eight_bit)) {
+    const ScaledImage copy = scaled(image.eight_bit, scale);
+    const std::vector<cv::Point2f> dots = findDots(copy.image);
+    const int count = static_cast<int>(dots.size());
+    if (count > 1000) continue;
+    for (int total = count; total >= std::max(count - kStray, kLeast * kLeast); --total) {
+      // From the squarest on: a symmetric grid is the same either way.
+      for (int rows = static_cast<int>(std::sqrt(total)); rows >= kLeast; --rows) {
+        if (total % rows != 0) continue;
+        for (const cv::Size size : {cv::Size(total / rows, rows), cv::Size(rows, total / rows)}) {
+          if (budget.spent()) return std::nullopt;
+          Target candidate = like;
+          candidate.cols = size.width;
+          candidate.rows = size.height;
+          std::size_t next = 0;
+          if (gridOfDots(copy, dots, candidate, budget, kHalfFields, &next)) return size;
+          if (!like.asymmetric) break;
+        }
+      }
+    }
+  }
+  return std::nullopt;
 }
 
 }  // namespace omnister::detect

@@ -140,15 +140,30 @@ GuidedPass detectGuided(const std::vector<std::string>& image_files, const Targe
   return pass;
 }
 
-bool servesBetter(const CalibrationResult& first, const CalibrationResult& second) {
-  const auto noise = [](const CalibrationResult& result) {
-    std::vector<std::vector<Eigen::Vector2d>> residuals;
-    for (const ViewResult& view : result.views) {
+namespace {
+
+/// Noise of what is fitted to these corners.
+double noiseOf(const std::vector<const CalibrationResult*>& cameras) {
+  std::vector<std::vector<Eigen::Vector2d>> residuals;
+  int points = 0;
+  for (const CalibrationResult* camera : cameras) {
+    points += camera->points;
+    for (const ViewResult& view : camera->views) {
       if (view.used) residuals.push_back(view.residuals);
     }
-    return calibration::statisticsOf(residuals).sigma_px / std::sqrt(std::max(1, result.points));
-  };
-  return noise(second) < noise(first) && second.rms_px <= 1.15 * first.rms_px;
+  }
+  return calibration::statisticsOf(residuals).sigma_px / std::sqrt(std::max(1, points));
+}
+
+}  // namespace
+
+bool servesBetter(const CalibrationResult& first, const CalibrationResult& second) {
+  return noiseOf({&second}) < noiseOf({&first}) && second.rms_px <= 1.15 * first.rms_px;
+}
+
+bool servesBetter(const StereoCalibrationResult& first, const StereoCalibrationResult& second) {
+  return noiseOf({&second.left, &second.right}) < noiseOf({&first.left, &first.right}) &&
+         second.rms_px <= 1.15 * first.rms_px;
 }
 
 }  // namespace omnister

@@ -8,6 +8,7 @@
 
 #include "fit.h"
 #include "omnister/calibration/calibrate.h"
+#include "omnister/common/text.h"
 
 namespace omnister::calibration {
 
@@ -65,8 +66,5 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
 /// Throws Error with the reason when the lens is not determined by these views.
 void refuseUndetermined(const FitInput& input, const BundleState& state, const LensModel& lens,
                         const Eigen::MatrixXd& covariance, cv::Size image_size);
-
-/// ISO 8601, UTC.
-std::string currentDate();
 
 }  // namespace omnister::calibration

@@ -565,6 +565,14 @@ std::optional<LocalFrame> frameFromMarker(const Marker& marker, const Eigen::Vec
   return frame;
 }
 
+void addNew(const std::vector<Marker>& found, std::vector<Marker>& markers) {
+  for (const Marker& marker : found) {
+    const bool known = std::any_of(markers.begin(), markers.end(),
+                                   [&](const Marker& other) { return other.id == marker.id; });
+    if (!known) markers.push_back(marker);
+  }
+}
+
 std::vector<Marker> consistentMarkers(const std::vector<Marker>& markers) {
   const auto middle = [](const std::vector<Eigen::Vector2d>& corners) -> Eigen::Vector2d {
     return 0.25 * (corners[0] + corners[1] + corners[2] + corners[3]);

@@ -36,10 +36,13 @@ double firstSquareContrast(const cv::Mat& fine, const Target& target, const Expe
 /// printed.
 struct Marker {
   int id = 0;
-  Eigen::Vector2i cell;                 ///< column and row
-  std::vector<Eigen::Vector2d> board;   ///< corners on the board [m]
-  std::vector<Eigen::Vector2d> pixels;  ///< and in the picture [px]
+  Eigen::Vector2i cell = Eigen::Vector2i::Zero();  ///< column and row
+  std::vector<Eigen::Vector2d> board;              ///< corners on the board [m]
+  std::vector<Eigen::Vector2d> pixels;             ///< and in the picture [px]
 };
+
+/// Appends those whose numbers are not there yet.
+void addNew(const std::vector<Marker>& found, std::vector<Marker>& markers);
 
 /// Without the markers that lie where their neighbours say they cannot: false decodings.
 std::vector<Marker> consistentMarkers(const std::vector<Marker>& markers);

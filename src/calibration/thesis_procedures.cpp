@@ -259,7 +259,7 @@ LensFile lensFile(const std::string& procedure, const std::string& model,
   file.image_size = image_size;
   file.lens = makeLens(model, center, parameters, max_theta, "--procedure " + procedure);
   file.calibration.points = static_cast<int>(points);
-  file.calibration.date = calibration::currentDate();
+  file.calibration.date = currentDate();
   file.calibration.notes["procedure"] = procedure + " (Johnson 1997)";
   return file;
 }

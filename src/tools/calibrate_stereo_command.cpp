@@ -46,6 +46,17 @@ void pairByName(Detections& left, Detections& right) {
   right = std::move(joined);
 }
 
+/// The corners of one camera again, guided by its lens.
+GuidedPass secondPass(const Arguments& arguments, const std::vector<std::string>& images,
+                      const LensModel& lens, const Detections& all) {
+  Detections first;
+  first.image_size = all.image_size;
+  for (const ViewDetections& view : all.views) {
+    if (!view.pixels.empty()) first.views.push_back(view);
+  }
+  return guidedPass(arguments.common, images, lens, first);
+}
+
 void run(const Arguments& arguments) {
   const auto begin = std::chrono::steady_clock::now();
   // A rig file names lens files: without an own place they stand beside it.
@@ -70,8 +81,35 @@ void run(const Arguments& arguments) {
   Detections right =
       gatherDetections(arguments.common, arguments.right_images, arguments.right_detections, true);
   if (!arguments.left_detections.empty()) pairByName(left, right);
-  const StereoCalibrationResult result =
+  StereoCalibrationResult result =
       calibrateStereo(left, right, calibrationOptions(arguments.common));
+  nlohmann::ordered_json second_pass;
+  if (!arguments.left_images.empty() && !arguments.common.one_pass) {
+    const GuidedPass on_left =
+        secondPass(arguments, arguments.left_images, *result.left.file.lens, left);
+    const GuidedPass on_right =
+        secondPass(arguments, arguments.right_images, *result.right.file.lens, right);
+    Detections left_again = overImages(on_left.detections, arguments.left_images);
+    Detections right_again = overImages(on_right.detections, arguments.right_images);
+    bool kept = false;
+    try {
+      StereoCalibrationResult again =
+          calibrateStereo(left_again, right_again, calibrationOptions(arguments.common));
+      kept = servesBetter(result, again);
+      if (kept) {
+        left = std::move(left_again);
+        right = std::move(right_again);
+        result = std::move(again);
+      }
+    } catch (const Error&) {
+      // The first fit stands.
+    }
+    second_pass = {{"left", secondPassFigures(on_left, kept)},
+                   {"right", secondPassFigures(on_right, kept)}};
+    for (auto [camera, side] : {std::pair{&result.left, "left"}, {&result.right, "right"}}) {
+      camera->file.calibration.notes["second_pass"] = second_pass[side].dump();
+    }
+  }
   for (const std::string& warning : result.warnings) say("warning: " + printable(warning, 1000));
 
   nlohmann::ordered_json json;
@@ -91,6 +129,7 @@ void run(const Arguments& arguments) {
   json["joint_holdout_rms_px"] = nullptr;
   if (result.holdout_rms_px) json["joint_holdout_rms_px"] = *result.holdout_rms_px;
   addFigures(json, {&result.left, &result.right});
+  if (!second_pass.is_null()) json["second_pass"] = second_pass;
   json["max_theta_rad"] =
       std::max(result.left.file.lens->maxTheta(), result.right.file.lens->maxTheta());
   json["baseline_m"] = result.T_left_right.translation().norm();

@@ -56,19 +56,40 @@ CalibrationOptions calibrationOptions(const CalibrationArguments& arguments) {
 namespace {
 
 // The commonest mistake: squares counted in place of inner corners, or another board than the
-// file's.
+// file's. Of coded boards a wrong size leaves a few corners of the first row.
 void checkBoardSize(const Target& target, const std::string& target_file,
-                    const std::vector<std::string>& missed) {
-  if (target.type != TargetType::kCheckerboard) return;
+                    const std::vector<std::string>& missed, const Detections& found) {
   constexpr std::size_t kLooks = 3;
-  const cv::Size asked(std::max(target.cols, target.rows), std::min(target.cols, target.rows));
-  for (std::size_t i = 0; i < std::min(kLooks, missed.size()); ++i) {
-    const auto seen = checkerboardSize(readImage(missed[i], ImageColor::kGray));
-    if (!seen || *seen == asked) continue;
+  const bool coded = target.type == TargetType::kCharuco || target.type == TargetType::kAprilGrid;
+  std::vector<std::string> doubtful;
+  if (coded || found.views.empty()) doubtful = missed;
+  const std::size_t points = targetPoints(target).size();
+  for (const ViewDetections& view : found.views) {
+    if (coded && 2 * view.pixels.size() < points) doubtful.push_back(view.name);
+  }
+  const char* what = "";
+  switch (target.type) {
+    case TargetType::kCheckerboard:
+      what = "inner corners";
+      break;
+    case TargetType::kCircles:
+      what = "dots";
+      break;
+    case TargetType::kCharuco:
+      what = "squares";
+      break;
+    case TargetType::kAprilGrid:
+      what = "tags";
+      break;
+  }
+  for (std::size_t i = 0; i < std::min(kLooks, doubtful.size()); ++i) {
+    const auto seen = otherBoardSize(readImage(doubtful[i], ImageColor::kGray), target);
+    if (!seen) continue;
     throw InputError(target_file, "cols and rows",
                      "are " + std::to_string(target.cols) + " and " + std::to_string(target.rows) +
-                         ", but " + missed[i] + " shows a board of " + std::to_string(seen->width) +
-                         " x " + std::to_string(seen->height) + " inner corners");
+                         ", but " + doubtful[i] + " shows a board of " +
+                         std::to_string(seen->width) + " x " + std::to_string(seen->height) + " " +
+                         what);
   }
 }
 
@@ -86,20 +107,22 @@ Detections gatherDetections(const CalibrationArguments& arguments,
   std::vector<std::string> missed;
   Detections detections = detectInFiles(images, target, options, &missed, consoleProgress());
   for (const std::string& name : missed) say("no board found in " + printable(name));
-  if (detections.views.empty()) checkBoardSize(target, arguments.target_file, missed);
-  if (!keep_missed) return detections;
+  checkBoardSize(target, arguments.target_file, missed, detections);
+  return keep_missed ? overImages(std::move(detections), images) : detections;
+}
+
+Detections overImages(Detections found, const std::vector<std::string>& images) {
   Detections all;
-  all.image_size = detections.image_size;
+  all.image_size = found.image_size;
   std::size_t next = 0;
   for (const std::string& image : images) {
-    if (next < detections.views.size() && detections.views[next].name == image) {
-      all.views.push_back(std::move(detections.views[next++]));
+    if (next < found.views.size() && found.views[next].name == image) {
+      all.views.push_back(std::move(found.views[next++]));
     } else {
       all.views.emplace_back().name = image;
     }
   }
-  if (next != detections.views.size())
-    throw Error("the detected views are not those of the images");
+  if (next != found.views.size()) throw Error("the detected views are not those of the images");
   return all;
 }
 

@@ -35,6 +35,9 @@ Detections gatherDetections(const CalibrationArguments& arguments,
                             const std::vector<std::string>& images,
                             const std::string& detections_file, bool keep_missed);
 
+/// One view an image, empty where nothing was found.
+Detections overImages(Detections found, const std::vector<std::string>& images);
+
 /// Detection once more in all images, guided by a fitted lens; images that it adds are named on
 /// standard error.
 GuidedPass guidedPass(const CalibrationArguments& arguments, const std::vector<std::string>& images,

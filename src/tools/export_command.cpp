@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // `export`: a lens file becomes a calibration that other programs read.
 #include <cmath>
-#include <cstdio>
 #include <memory>
 #include <optional>
 
@@ -9,6 +8,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/text.h"
 #include "omnister/lens/lens_export.h"
 
 namespace omnister::tools {
@@ -26,12 +26,6 @@ struct Options {
   bool narrow = false;
 };
 
-std::string round(double value, int digits) {
-  char text[64];
-  std::snprintf(text, sizeof text, "%.*f", digits, value);
-  return text;
-}
-
 void run(const Options& options, bool json) {
   checkOutputs({options.lens}, {options.out});
   const LensFile file = readLensFile(options.lens);
@@ -44,8 +38,9 @@ void run(const Options& options, bool json) {
       made = exportLens(file, options.format, options.model, narrowed);
       if (!(made.residual_rms_px <= options.max_residual_px)) {
         failure = "the nearest " + made.model + " camera misses this lens by " +
-                  round(made.residual_rms_px, 3) + " px RMS (" + round(made.residual_max_px, 2) +
-                  " px at worst) over " + round(made.max_theta_rad * 90.0 / kHalfPi, 1) +
+                  formatFixed(made.residual_rms_px, 3) + " px RMS (" +
+                  formatFixed(made.residual_max_px, 2) + " px at worst) over " +
+                  formatFixed(made.max_theta_rad * 90.0 / kHalfPi, 1) +
                   " degrees off the axis, more than " + formatNumber(options.max_residual_px) +
                   " px";
         for (const std::string& remark : made.remarks) failure += "; " + remark;
@@ -62,9 +57,9 @@ void run(const Options& options, bool json) {
       made = *widest;
       const double whole = file.lens->maxTheta();
       if (made.max_theta_rad < whole - 1e-3) {
-        say("only " + round(made.max_theta_rad * 90.0 / kHalfPi, 1) +
-            " degrees off the axis are said, of the lens' " + round(whole * 90.0 / kHalfPi, 1) +
-            ": rays beyond come out wrong");
+        say("only " + formatFixed(made.max_theta_rad * 90.0 / kHalfPi, 1) +
+            " degrees off the axis are said, of the lens' " +
+            formatFixed(whole * 90.0 / kHalfPi, 1) + ": rays beyond come out wrong");
       }
     } else if (options.narrow) {
       throw InputError(options.lens, "",
@@ -73,16 +68,16 @@ void run(const Options& options, bool json) {
                            " px RMS of this lens, not even over 10 degrees off the axis");
     } else {
       if (widest && widest->max_theta_rad > 1e-3) {
-        failure += "; over " + round(widest->max_theta_rad * 90.0 / kHalfPi, 1) +
+        failure += "; over " + formatFixed(widest->max_theta_rad * 90.0 / kHalfPi, 1) +
                    " degrees off the axis " + widest->model + " comes within " +
-                   round(widest->residual_rms_px, 3) + " px: --narrow writes that";
+                   formatFixed(widest->residual_rms_px, 3) + " px: --narrow writes that";
       }
       throw InputError(
           options.lens, "",
           failure + "; another --format may come nearer, --max-residual PX allows more");
     }
   }
-  const std::string degrees = round(made.max_theta_rad * 90.0 / kHalfPi, 1);
+  const std::string degrees = formatFixed(made.max_theta_rad * 90.0 / kHalfPi, 1);
   for (const std::string& remark : made.remarks) say(remark);
   writeFileAtomically(options.out, made.text);
   if (made.max_theta_rad >= kHalfPi &&

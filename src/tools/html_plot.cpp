@@ -9,6 +9,7 @@
 #include <opencv2/imgcodecs.hpp>
 
 #include "omnister/common/error.h"
+#include "omnister/common/text.h"
 
 namespace omnister::tools {
 namespace {
@@ -38,10 +39,7 @@ std::string base64(const unsigned char* bytes, std::size_t size) {
 }  // namespace
 
 std::string fixed(double value, int digits) {
-  if (!std::isfinite(value)) return "-";
-  char text[64];
-  std::snprintf(text, sizeof text, "%.*f", digits, value);
-  return text;
+  return std::isfinite(value) ? formatFixed(value, digits) : "-";
 }
 
 std::string escaped(const std::string& text) {

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // `import`: somebody else's calibration becomes a lens file.
 #include <cmath>
-#include <ctime>
 #include <memory>
 
 #include "commands.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/text.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_import.h"
 
@@ -28,21 +28,6 @@ struct Options {
   int even_terms = 3;
   bool model_given = false;
 };
-
-std::string round(double value, int digits) {
-  char text[64];
-  std::snprintf(text, sizeof text, "%.*f", digits, value);
-  return text;
-}
-
-std::string today() {
-  const std::time_t now = std::time(nullptr);
-  std::tm utc{};
-  ::gmtime_r(&now, &utc);
-  char text[32];
-  std::strftime(text, sizeof text, "%Y-%m-%dT%H:%M:%SZ", &utc);
-  return text;
-}
 
 /// A lens file needs no import: it goes through as it is, never refitted.
 bool isLensFile(const std::string& text) {
@@ -89,24 +74,24 @@ void run(const Options& options, bool json) {
   const ForeignFit fit = fitForeignCamera(camera, options.model, options.even_terms, options.knots);
   const double max_theta = fit.fit.lens->maxTheta();
   if (fit.field.image >= fit.field.one_to_one - 1e-9) {
-    say("the source is one-to-one only up to " + round(max_theta * kDegrees, 1) +
+    say("the source is one-to-one only up to " + formatFixed(max_theta * kDegrees, 1) +
         " degrees off the axis, which the image reaches: pixels beyond have no ray");
   }
   const bool within = std::isfinite(fit.fit.rms_px) && fit.fit.rms_px <= options.max_residual_px;
   if (!within) {
-    throw InputError(options.file, "",
-                     "a " + options.model + " surface misses its " + camera.model + " model by " +
-                         round(fit.fit.rms_px, 3) + " px RMS (" + round(fit.fit.max_px, 2) +
-                         " px at worst) over " + round(max_theta * kDegrees, 1) +
-                         " degrees off the axis, more than " +
-                         formatNumber(options.max_residual_px) +
-                         " px; another --model may come nearer, --max-residual PX allows it");
+    throw InputError(
+        options.file, "",
+        "a " + options.model + " surface misses its " + camera.model + " model by " +
+            formatFixed(fit.fit.rms_px, 3) + " px RMS (" + formatFixed(fit.fit.max_px, 2) +
+            " px at worst) over " + formatFixed(max_theta * kDegrees, 1) +
+            " degrees off the axis, more than " + formatNumber(options.max_residual_px) +
+            " px; another --model may come nearer, --max-residual PX allows it");
   }
   LensFile file;
   file.image_size = camera.image_size;
   if (!camera.camera_name.empty()) file.camera_name = camera.camera_name;
   file.lens = fit.fit.lens;
-  file.calibration.date = today();
+  file.calibration.date = currentDate();
   file.calibration.notes["imported_from"] = camera.format + " " + camera.model;
   file.calibration.notes["import_residual_rms_px"] = formatNumber(fit.fit.rms_px);
   file.calibration.notes["import_residual_max_px"] = formatNumber(fit.fit.max_px);

@@ -38,9 +38,11 @@ Detections detectInFiles(const std::vector<std::string>& image_files, const Targ
                          const DetectorOptions& options, std::vector<std::string>* missed,
                          const Progress& progress = {});
 
-/// Inner corners (columns and rows, the larger first) of a plain checkerboard of any size: for
-/// telling a person which board the images show when it is not the one that was asked for.
-/// @return nullopt when no board is seen
-std::optional<cv::Size> checkerboardSize(const cv::Mat& image);
+/// For telling a person which board the images show when it is not the one that was asked for:
+/// columns and rows, counted as in Target, of a board of the same type (and dictionary) but another
+/// size. Of a checkerboard the larger comes first; of a coded board partly out of the picture the
+/// rows are those that are seen.
+/// @return nullopt when no board is seen, or the one that was asked for
+std::optional<cv::Size> otherBoardSize(const cv::Mat& image, const Target& asked);
 
 }  // namespace omnister

@@ -29,5 +29,7 @@ GuidedPass detectGuided(const std::vector<std::string>& image_files, const Targe
 /// Whether the corners of a second pass served the fit better than those of the first: less noise a
 /// corner or more corners, and no worse outliers.
 bool servesBetter(const CalibrationResult& first, const CalibrationResult& second);
+/// Both cameras together.
+bool servesBetter(const StereoCalibrationResult& first, const StereoCalibrationResult& second);
 
 }  // namespace omnister

@@ -152,20 +152,58 @@ TEST_F(CalibrateRefusals, ImagesOfDifferentSizeAndAnotherBoard) {
   EXPECT_EQ(sizes.code, 1);
   EXPECT_THAT(sizes.err, AllOf(HasSubstr("large.png"), HasSubstr("is 44x30 pixels"),
                                HasSubstr("expected 40x30 as"), HasSubstr("small.png")));
+}
 
-  // The board has 8 x 5 inner corners.
-  const cv::Size size(480, 360);
+TEST_F(CalibrateRefusals, AnotherBoardIsNamedByItsSize) {
+  const cv::Size size(640, 480);
   const LensPtr lens = test::wideLens(size);
-  const Target shown = parseTarget("{type: checkerboard, cols: 8, rows: 5, square_m: 0.03}", "t");
-  const std::string board = folder_.path() / "board.png";
-  ASSERT_TRUE(cv::imwrite(
-      board, test::draw(shown, test::boardPose(shown, {10, 30, 0.25, 20, 20}), *lens, size)));
-  const test::Outcome other =
-      test::run({"calibrate", "--target", target, board, "--out", lens_file_});
-  EXPECT_EQ(other.code, 1);
-  EXPECT_THAT(other.err, AllOf(HasSubstr("target.yaml"), HasSubstr("are 9 and 6"),
-                               HasSubstr("shows a board of 8 x 5 inner corners")));
-  EXPECT_FALSE(std::filesystem::exists(lens_file_));
+  struct Case {
+    Target shown;
+    int cols, rows;  ///< that the target file asks for
+    std::string says;
+  };
+  Target charuco{TargetType::kCharuco, 7, 5, 0.03};
+  charuco.marker_m = 0.022;
+  charuco.dictionary = "DICT_4X4_50";
+  Target tags{TargetType::kAprilGrid, 5, 4, 0.03};
+  tags.spacing = 0.3;
+  tags.dictionary = "tag36h11";
+  const Target dots{TargetType::kCircles, 7, 6, 0.03};
+  Target shifted{TargetType::kCircles, 4, 9, 0.03};
+  shifted.asymmetric = true;
+  const Target squares{TargetType::kCheckerboard, 8, 5, 0.03};
+  const std::vector<Case> cases = {{squares, 9, 6, "8 x 5 inner corners"},
+                                   {charuco, 5, 7, "7 x 5 squares"},
+                                   {charuco, 8, 6, "7 x 5 squares"},
+                                   {tags, 4, 5, "5 x 4 tags"},
+                                   {tags, 6, 6, "5 x 4 tags"},
+                                   {dots, 8, 6, "7 x 6 dots"},
+                                   {dots, 6, 5, "7 x 6 dots"},
+                                   {shifted, 4, 11, "4 x 9 dots"}};
+  const std::string target = folder_.path() / "target.yaml";
+  for (const Case& c : cases) {
+    Target asked = c.shown;
+    asked.cols = c.cols;
+    asked.rows = c.rows;
+    SCOPED_TRACE(formatTarget(asked));
+    writeFileAtomically(target, formatTarget(asked));
+    const std::string board = folder_.path() / "board.png";
+    ASSERT_TRUE(cv::imwrite(
+        board, test::draw(c.shown, test::boardPose(c.shown, {10, 30, 0.25, 20, 10}), *lens, size)));
+    const test::Outcome outcome =
+        test::run({"calibrate", "--target", target, board, "--out", lens_file_});
+    EXPECT_EQ(outcome.code, 1);
+    EXPECT_THAT(outcome.err,
+                AllOf(HasSubstr("target.yaml"),
+                      HasSubstr("are " + std::to_string(c.cols) + " and " + std::to_string(c.rows)),
+                      HasSubstr("board.png shows a board of " + c.says)));
+    EXPECT_FALSE(std::filesystem::exists(lens_file_));
+    // The right file is not refused for its size.
+    writeFileAtomically(target, formatTarget(c.shown));
+    const test::Outcome right =
+        test::run({"calibrate", "--target", target, board, "--out", lens_file_});
+    EXPECT_THAT(right.err, AllOf(HasSubstr("at least 3 different views"), HasSubstr("1 of 1")));
+  }
 }
 
 }  // namespace

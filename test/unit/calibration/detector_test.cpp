@@ -279,10 +279,14 @@ TEST(Detector, PartOfALargerBoardIsNotTheBoard) {
   for (const auto& [cols, rows] : {std::pair{6, 4}, {7, 6}, {8, 5}, {6, 6}, {4, 3}}) {
     const Target asked{TargetType::kCheckerboard, cols, rows, 0.02};
     EXPECT_FALSE(detectTarget(image, asked).has_value()) << cols << " x " << rows;
+    EXPECT_EQ(otherBoardSize(image, asked), cv::Size(8, 6));
   }
-  EXPECT_EQ(checkerboardSize(image), cv::Size(8, 6));
-  EXPECT_EQ(checkerboardSize(cv::Mat(200, 300, CV_8UC1, cv::Scalar(7))), std::nullopt);
-  EXPECT_EQ(checkerboardSize(cv::Mat()), std::nullopt);
+  const Target turned{TargetType::kCheckerboard, 6, 8, 0.02};
+  for (const Target& same : {shown, turned}) {
+    EXPECT_EQ(otherBoardSize(image, same), std::nullopt);
+    EXPECT_EQ(otherBoardSize(cv::Mat(200, 300, CV_8UC1, cv::Scalar(7)), same), std::nullopt);
+    EXPECT_EQ(otherBoardSize(cv::Mat(), same), std::nullopt);
+  }
 }
 
 TEST_F(ImageFiles, CornersAreTheSameForAnyNumberOfThreads) {

@@ -12,7 +12,7 @@
 
 #include "omnister/calibration/target_free.h"
 #include "omnister/common/error.h"
-#include "omnister/sim/renderer.h"
+#include "rendered_scans.h"
 #include "unit/stereo/real_data.h"
 
 namespace omnister {
@@ -20,51 +20,10 @@ namespace {
 
 constexpr double kDegree = M_PI / 180.0;
 
-struct RenderedScans {
-  LensPtr lens;
-  Eigen::Vector3d axis = Eigen::Vector3d(0.998, -0.02, 0.05).normalized();
-  std::vector<Pose> T_world_scan;
-  std::vector<StageScan> scans;
-  std::vector<cv::Mat> middle_range;  ///< of the middle image of every scan [m]
-};
-
-RenderedScans renderScans(cv::Size size, double focal, int positions, int orientations) {
-  RenderedScans result;
-  LensStructure structure;
-  structure.model = "asphere";
-  structure.even_terms = 1;
-  result.lens = makeLens(structure, {0.51 * size.width, 0.49 * size.height}, focal, 95.0 * kDegree);
-  const sim::ScenePtr scene =
-      sim::readScene(std::string(OMNISTER_SOURCE_DIR) + "/config/scenes/room.yaml");
-  const sim::Renderer renderer(*result.lens, size);
-  const double turns[3][3] = {{0, 0, 0}, {24, 6, 4}, {-6, -22, -8}};
-  for (int k = 0; k < orientations; ++k) {
-    Pose pose = Pose::Identity();
-    pose.linear() = (Eigen::AngleAxisd(turns[k][0] * kDegree, Eigen::Vector3d::UnitY()) *
-                     Eigen::AngleAxisd(turns[k][1] * kDegree, Eigen::Vector3d::UnitX()) *
-                     Eigen::AngleAxisd(turns[k][2] * kDegree, Eigen::Vector3d::UnitZ()))
-                        .toRotationMatrix();
-    pose.translation() = Eigen::Vector3d(0.08 * k, -0.05 * k, 0.06 * k);
-    result.T_world_scan.push_back(pose);
-    StageScan scan;
-    for (int i = 0; i < positions; ++i) {
-      const double travel = 0.05 * (i - positions / 2);
-      sim::RenderOptions options;
-      options.adaptive = true;
-      options.color = false;
-      options.noise_sigma = 1.0;
-      options.seed = static_cast<std::uint64_t>(100 * k + i + 1);
-      Pose camera = pose;
-      camera.translation() += pose.linear() * (travel * result.axis);
-      auto frame = renderer.render(*scene, camera, options);
-      if (i == positions / 2) result.middle_range.push_back(frame.range);
-      scan.images.push_back(frame.image);
-      scan.positions_m.push_back(travel);
-    }
-    result.scans.push_back(scan);
-  }
-  return result;
-}
+using test::angleRms;
+using test::bestAngleRms;
+using test::RenderedScans;
+using test::renderScans;
 
 TEST(FeatureTracks, FollowsRenderedPointsAndMatchesTurnedScans) {
   const RenderedScans rendered = renderScans({640, 480}, 150.0, 5, 2);
@@ -128,32 +87,6 @@ TEST(FeatureTracks, RefusesScansThatAreNone) {
   EXPECT_THROW(trackFeatures({scan}), Error);
   scan.positions_m = {0.0, 0.1};
   EXPECT_TRUE(trackFeatures({scan}).tracks.empty());
-}
-
-double angleRms(const LensModel& truth, const LensModel& fitted, cv::Size size, double c) {
-  double sum = 0.0;
-  int count = 0;
-  for (int v = 0; v < size.height; v += 8) {
-    for (int u = 0; u < size.width; u += 8) {
-      const auto a = truth.unproject({u, v});
-      auto b = fitted.unproject({u, v});
-      if (!a || !b || std::acos(a->z()) > 90.0 * kDegree) continue;
-      b->z() *= c;
-      const double angle = std::atan2(a->cross(*b).norm(), a->dot(*b));
-      sum += angle * angle;
-      ++count;
-    }
-  }
-  EXPECT_GT(count, 2000);
-  return std::sqrt(sum / count) / kDegree;
-}
-
-double bestAngleRms(const LensModel& truth, const LensModel& fitted, cv::Size size) {
-  double best = 1e9;
-  for (double c = 0.5; c < 2.0; c *= 1.002) {
-    best = std::min(best, angleRms(truth, fitted, size, c));
-  }
-  return best;
 }
 
 TEST(FeatureTracks, LensFromARenderedRoom) {

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <gtest/gtest.h>
-
 #include <Eigen/Core>
 #include <algorithm>
 #include <cmath>
@@ -19,7 +17,8 @@ struct Residual {
   double max = 0.0;
 };
 
-/// How far two projections lie apart [px] over rays on rings; both have to see all of them.
+/// How far two projections lie apart [px] over rays on rings; 1e9 where one does not see all of
+/// them.
 /// @param thetas from the axis [rad]
 /// @param azimuths rays on each ring, the first at `phi` [rad]
 template <typename Expected, typename Project>
@@ -31,7 +30,6 @@ Residual projectionResidual(const std::vector<double>& thetas, int azimuths, dou
       const Eigen::Vector3d n = direction(theta, phi + j * 2.0 * M_PI / azimuths);
       const auto wanted = expected(n);
       const auto pixel = project(n);
-      EXPECT_TRUE(wanted && pixel) << n.transpose();
       if (!wanted || !pixel) return {1e9, 1e9};
       const double error = (*pixel - *wanted).norm();
       out.rms += error * error;

@@ -11,12 +11,11 @@
 #include <string>
 #include <vector>
 
-#include "command_run.h"
+#include "command_folder.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
-#include "temporary_folder.h"
 
 namespace omnister {
 namespace {
@@ -24,10 +23,8 @@ namespace {
 using test::Outcome;
 using test::run;
 
-namespace fs = std::filesystem;
 using ::testing::AllOf;
 using ::testing::HasSubstr;
-using ::testing::StartsWith;
 using Arguments = std::vector<std::string>;
 
 constexpr char kChain[] =
@@ -35,7 +32,7 @@ constexpr char kChain[] =
     "  distortion_model: none\n  distortion_coeffs: []\n  resolution: [1280, 960]\n"
     "  rostopic: /cam0/image_raw\n";
 
-class LensCommands : public ::testing::Test {
+class LensCommands : public test::CommandFolder {
  protected:
   void SetUp() override {
     file_.image_size = {1280, 960};
@@ -46,28 +43,10 @@ class LensCommands : public ::testing::Test {
     writeLensFile(path("lens.yaml"), file_);
     writeFileAtomically(path("chain.yaml"), kChain);
   }
-  std::string path(const std::string& name) const { return (folder_.path() / name).string(); }
-  std::size_t entries() const {
-    return std::distance(fs::directory_iterator(folder_.path()), fs::directory_iterator());
-  }
-  // A failure: this exit code, nothing on standard output, no file made or changed, and what was
-  // said: a single line where work began.
   std::string refusal(const Arguments& arguments, int code = 1) const {
-    writeFileAtomically(path("old.yaml"), "old");
-    const std::size_t before = entries();
-    const Outcome outcome = run(arguments);
-    EXPECT_EQ(outcome.code, code) << outcome.err;
-    EXPECT_EQ(outcome.out, "");
-    if (code == 1) {
-      EXPECT_EQ(std::count(outcome.err.begin(), outcome.err.end(), '\n'), 1) << outcome.err;
-      EXPECT_THAT(outcome.err, StartsWith("omnister: "));
-    }
-    EXPECT_EQ(entries(), before);
-    EXPECT_EQ(readFile(path("old.yaml")), "old");
-    return outcome.err;
+    return refused(arguments, code, {"old.yaml"});
   }
 
-  test::TemporaryFolder folder_;
   LensFile file_;
 };
 

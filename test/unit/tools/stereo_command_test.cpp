@@ -2,7 +2,6 @@
 // `omnister stereo` and `omnister evaluate plane` as a person calls them.
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
-#include <unistd.h>
 
 #include <filesystem>
 #include <nlohmann/json.hpp>
@@ -11,7 +10,7 @@
 #include <string>
 #include <vector>
 
-#include "command_run.h"
+#include "command_folder.h"
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
@@ -28,14 +27,11 @@ namespace fs = std::filesystem;
 using ::testing::AllOf;
 using ::testing::HasSubstr;
 
-class StereoCommand : public ::testing::Test {
+class StereoCommand : public test::CommandFolder {
  protected:
   static constexpr const char* kPose = "-0.3 0 0 0 0 0 1";
 
   void SetUp() override {
-    std::string name = (fs::temp_directory_path() / "omnister-XXXXXX").string();
-    ASSERT_NE(::mkdtemp(name.data()), nullptr);
-    folder_ = name;
     LensFile lens;
     lens.image_size = {128, 96};
     lens.lens = makeLens(LensStructure{}, {63.2, 47.9}, 55.0, 1.3);
@@ -46,9 +42,6 @@ class StereoCommand : public ::testing::Test {
     cv::imwrite(path("reference.png"), reference_);
     cv::imwrite(path("displaced.png"), displaced_);
   }
-  void TearDown() override { fs::remove_all(folder_); }
-
-  std::string path(const std::string& name) const { return (folder_ / name).string(); }
 
   // The arguments that work, with some changed ("" leaves one out) and some added.
   std::vector<std::string> arguments(const std::map<std::string, std::string>& changed = {},
@@ -73,28 +66,10 @@ class StereoCommand : public ::testing::Test {
     return result;
   }
 
-  // A refusal: one line, the exit code, no output touched.
   std::string refusal(const std::vector<std::string>& call, int code = 1) const {
-    writeFileAtomically(path("cloud.ply"), "old cloud");
-    writeFileAtomically(path("range.tiff"), "old range");
-    const std::size_t before = entries();
-    const Outcome outcome = run(call);
-    EXPECT_EQ(outcome.code, code) << outcome.err;
-    EXPECT_EQ(outcome.out, "");
-    if (code == 1) {
-      EXPECT_EQ(std::count(outcome.err.begin(), outcome.err.end(), '\n'), 1) << outcome.err;
-    }
-    EXPECT_EQ(readFile(path("cloud.ply")), "old cloud");
-    EXPECT_EQ(readFile(path("range.tiff")), "old range");
-    EXPECT_EQ(entries(), before);
-    return outcome.err;
+    return refused(call, code, {"cloud.ply", "range.tiff"});
   }
 
-  std::size_t entries() const {
-    return std::distance(fs::directory_iterator(folder_), fs::directory_iterator());
-  }
-
-  fs::path folder_;
   cv::Mat reference_, displaced_;
 };
 
