@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 DOCUMENTS = ['README.md'] + ['docs/%s.md' % name for name in
-                             ('tour', 'rig', 'choosing', 'architecture', 'extending', 'nodes', 'lens_models')]
+                             ('tour', 'rig', 'choosing', 'architecture', 'extending', 'faults', 'nodes', 'lens_models')]
 BLOCK = re.compile(r'^( *)```sh\n(.*?)^\1```\n(?:\1<!-- run: (.*?) -->\n)?', re.M | re.S)
 LINK = re.compile(r'\]\(([^)#:]+)\)')
 # Poses of the camera before the board of config/scenes/calibration_board.yaml: x y z [m], half the turns [rad].

@@ -6,6 +6,7 @@
 #include <cstdlib>
 #include <system_error>
 
+#include "omnister/common/contained_path.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
@@ -14,11 +15,6 @@ namespace omnister {
 namespace {
 
 namespace fs = std::filesystem;
-
-bool allowed(unsigned char c) {
-  return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '-' ||
-         c == '_' || c == '.';
-}
 
 fs::path defaultFolder() {
   if (const char* ros_home = std::getenv("ROS_HOME"); ros_home != nullptr && *ros_home != '\0') {
@@ -117,9 +113,7 @@ LensStore::LensStore(fs::path folder)
     : folder_(folder.empty() ? defaultFolder() : std::move(folder)) {}
 
 fs::path LensStore::pathOf(const std::string& name) const {
-  constexpr std::size_t kMaxName = 100;
-  if (name.empty() || name.size() > kMaxName || name[0] == '.' ||
-      !std::all_of(name.begin(), name.end(), allowed)) {
+  if (!isPlainName(name)) {
     throw InputError("store", "name",
                      "is \"" + printable(name) +
                          "\", expected letters, digits, '-', '_' and '.', not beginning with '.'");
@@ -270,7 +264,7 @@ StoredLens LensStore::rollBack(const std::string& name, std::optional<int> versi
 std::string LensStore::nameFrom(const std::string& text) {
   std::string name = text.substr(0, 100);
   for (char& c : name) {
-    if (!allowed(static_cast<unsigned char>(c))) c = '_';
+    if (c != '.' && !isPlainName(std::string(1, c))) c = '_';
   }
   if (name.empty() || name[0] == '.') name.insert(0, "camera");
   return name.substr(0, 100);

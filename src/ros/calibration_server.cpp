@@ -9,6 +9,7 @@
 #include <cstdio>
 #include <limits>
 
+#include "omnister/common/contained_path.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
@@ -352,9 +353,8 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
 }
 
 fs::path CalibrationServer::keepViews(const Detections& detections) const {
-  fs::path path = LensStore(parameters_.store).pathOf(parameters_.camera_name);
-  fs::create_directories(path.parent_path());
-  path.replace_filename(parameters_.camera_name + "_detections.csv");
+  const fs::path path = pathInside(LensStore(parameters_.store).folder(),
+                                   parameters_.camera_name + "_detections.csv", "~store", "");
   writeFileAtomically(path, formatDetections(detections), Previous::kKeep);
   return path;
 }

@@ -9,8 +9,10 @@
 #include <iomanip>
 #include <sstream>
 
+#include "omnister/common/numbers.h"
 #include "omnister/lens/lens_part.h"
 #include "omnister/ros/conversions.h"
+#include "omnister/ros/live_parameters.h"
 #include "omnister/ros/parameters.h"
 
 namespace omnister {
@@ -22,6 +24,8 @@ constexpr std::chrono::milliseconds kGrabTimeout(200);
 constexpr std::chrono::seconds kRepeatProblem(30);
 constexpr std::chrono::seconds kPollStatistics(1);
 constexpr std::chrono::milliseconds kLookForListeners(50), kLookAfterDevice(250);
+// Frames that stay away for so long, and for four of their intervals, are a problem [s].
+constexpr double kSilent = 0.7;
 // A service waits so long for the device; what is asked for is done later all the same.
 constexpr std::chrono::seconds kDeviceAnswers(3);
 // The stage of a recording stands at its position this long around a settled frame [s], and no
@@ -271,22 +275,26 @@ void CameraDriver::openIfNeeded() {
 }
 
 void CameraDriver::close(const std::string& problem) {
-  if (camera_) camera_->abandon();
-  camera_.reset();
-  streaming_ = false;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     state_ = "lost";
     problem_ = problem;
     ++losses_of_device_;
   }
-  const bool again = problem == told_problem_ && Steady::now() - told_at_ < kRepeatProblem;
+  tell(problem);
+  // Takes seconds where the device does not answer.
+  if (camera_) camera_->abandon();
+  camera_.reset();
+  streaming_ = false;
+}
+
+void CameraDriver::tell(const std::string& problem) {
   if (parameters_.exit_on_error) {
     ROS_ERROR_STREAM(printable(problem, 1000));
     failed_ = true;
     return;
   }
-  if (again) return;
+  if (problem == told_problem_ && Steady::now() - told_at_ < kRepeatProblem) return;
   told_problem_ = problem;
   told_at_ = Steady::now();
   ROS_WARN_STREAM("no camera, trying again every " << parameters_.retry_period_s
@@ -330,6 +338,7 @@ void CameraDriver::stream() {
   takeRemarks();
   if (frame) {
     countLost(*frame);
+    if (streamed_) interval_s_ = secondsSince(last_frame_);
     last_frame_ = Steady::now();
     streamed_ = true;
     publish(*frame);
@@ -341,7 +350,14 @@ void CameraDriver::stream() {
 void CameraDriver::watch() {
   if (settings_.trigger != "off") return;
   const double silent = secondsSince(last_frame_);
-  if (silent <= std::max(parameters_.watchdog_s, slowest_s_)) return;
+  if (silent <= std::max(parameters_.watchdog_s, slowest_s_)) {
+    // Said before it is acted upon, as the frames came until now.
+    if (streamed_ && silent > std::max({kSilent, 4.0 * interval_s_, slowest_s_})) {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      problem_ = "no frame since " + formatNumber(std::round(10.0 * silent) / 10.0) + " s";
+    }
+    return;
+  }
   std::ostringstream problem;
   problem << std::fixed << std::setprecision(1) << "the camera gives no frame for " << silent
           << " s";
@@ -378,6 +394,8 @@ void CameraDriver::takeRemarks() {
 }
 
 void CameraDriver::pollStatistics() {
+  // A device that has gone silent may not answer either, and the watchdog must not wait for it.
+  if (streaming_ && streamed_ && secondsSince(last_frame_) > 0.5 * kSilent) return;
   if (Steady::now() < statistics_due_) return;
   statistics_due_ = Steady::now() + kPollStatistics;
   const device::CameraStatistics statistics = camera_->statistics();
@@ -451,6 +469,7 @@ bool CameraDriver::onTrigger(std_srvs::Trigger::Request& /*request*/,
 }
 
 void CameraDriver::configure(CameraConfig& config) {
+  keepFinite(config, config_);
   device::CameraControls wanted;
   // What is as it was is not touched: it may be another's choice, or the device's own.
   if (config.exposure_us > 0.0 && config.exposure_us != config_.exposure_us) {
@@ -551,6 +570,8 @@ void CameraDriver::publish(const device::Frame& frame) {
   const sensor_msgs::ImagePtr image = toMessage(frame);
   image->header.stamp = toRosTime(frame.stamp);
   image->header.frame_id = parameters_.frame_id;
+  // Those in our process get this very message: they see by its number what they missed.
+  image->header.seq = ++published_;
   info->header = image->header;
   publishRecordedStage(frame, image->header.stamp);
   images_.publish(image, info);

@@ -388,6 +388,14 @@ std::vector<Finding> diagnose(const DoctorFacts& facts) {
                    "roslaunch starts one; or set ROS_MASTER_URI to that of the robot");
     return findings.take();
   }
+  if (!facts.registered) {
+    findings.error("master_restarted",
+                   "the ROS master was started anew and knows nobody who was there before: topics "
+                   "that are joined go "
+                   "on, new listeners find nothing",
+                   "launch the nodes again");
+    return findings.take();
+  }
   machine(facts, findings);
   if (findings.failed()) return findings.take();
   const DoctorFacts::Stereo& stereo = facts.stereo;

@@ -6,6 +6,7 @@
 #include <ros/ros.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cstdlib>
 #include <iostream>
 #include <nlohmann/json.hpp>
@@ -56,11 +57,23 @@ void printText(const DoctorFacts& facts, const std::vector<Finding>& findings) {
             << std::endl;
 }
 
+/// Long after the start: the master may have gone, or been started anew.
+DoctorFacts look(const DoctorOptions& options) {
+  DoctorFacts facts;
+  facts.master_uri = ros::master::getURI();
+  facts.master = answers(facts.master_uri) && ros::master::check();
+  ros::V_string nodes;
+  facts.registered =
+      !facts.master || !ros::master::getNodes(nodes) ||
+      std::find(nodes.begin(), nodes.end(), ros::this_node::getName()) != nodes.end();
+  return facts.master && facts.registered ? gatherFacts(options) : facts;
+}
+
 void watch(const DoctorOptions& options, double period) {
   ros::NodeHandle node;
   ros::Publisher publisher = node.advertise<diagnostic_msgs::DiagnosticArray>("/diagnostics", 10);
   while (ros::ok()) {
-    const std::vector<Finding> findings = diagnose(gatherFacts(options));
+    const std::vector<Finding> findings = diagnose(look(options));
     diagnostic_msgs::DiagnosticArray message;
     message.header.stamp = ros::Time::now();
     diagnostic_msgs::DiagnosticStatus status;

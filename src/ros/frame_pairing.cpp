@@ -11,6 +11,8 @@
 namespace omnister {
 namespace {
 
+constexpr double kFastest = 2.0;  // [m/s] of a stage
+
 std::int64_t nanoseconds(double seconds) { return static_cast<std::int64_t>(seconds * 1e9); }
 
 double distance(const Pose& a, const Pose& b) { return (a.translation() - b.translation()).norm(); }
@@ -111,9 +113,12 @@ FramePairing::Verdict FramePairing::judge(PairingFrame& frame, const PoseLookup&
     const double moved = distance(at.T_fixed_camera, beside.T_fixed_camera);
     const double turned = angle(at.T_fixed_camera, beside.T_fixed_camera);
     if (!(moved <= options_.settle_distance) || !(turned <= options_.settle_angle)) {
-      drop("moving", "the camera moves: " + metres(moved) + " and " + degrees(turned) + " within " +
+      const bool jumps = moved > kFastest * options_.settle_time;
+      drop("moving", std::string(jumps ? "tf jumps (does somebody else publish it?): "
+                                       : "the camera moves: ") +
+                         metres(moved) + " and " + degrees(turned) + " within " +
                          std::to_string(std::lround(options_.settle_time * 1e3)) + " ms");
-      return Verdict::kDrop;
+      return jumps ? Verdict::kDrop : Verdict::kMoving;
     }
   }
   return Verdict::kSettled;
@@ -206,6 +211,7 @@ std::optional<FrameSet> FramePairing::poll(const PoseLookup& lookup, std::int64_
   while (!waiting_.empty()) {
     Waiting& next = waiting_.front();
     const Verdict verdict = judge(next.frame, lookup);
+    moving_ = verdict == Verdict::kMoving;
     if (verdict == Verdict::kWait) {
       next.reason = reason_;
       if (now_ns - next.since_ns <= nanoseconds(options_.max_wait)) break;

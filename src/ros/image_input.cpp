@@ -6,6 +6,7 @@
 
 #include <boost/make_shared.hpp>
 #include <opencv2/core.hpp>
+#include <utility>
 
 #include "omnister/common/error.h"
 #include "omnister/ros/conversions.h"
@@ -53,6 +54,11 @@ cv::Mat convert(const sensor_msgs::Image& image, int bits, const std::string& wa
 }
 
 }  // namespace
+
+std::uint32_t MissingMessages::before(const std_msgs::Header& header) {
+  const std::uint32_t last = std::exchange(last_, header.seq);
+  return last != 0 && header.seq > last ? header.seq - last - 1 : 0;
+}
 
 void checkFrame(const sensor_msgs::Image& image, cv::Size expected, const std::string& topic) {
   const auto refuse = [&](const char* place, const std::string& problem) {

@@ -7,11 +7,13 @@
 #include <cmath>
 #include <cstdio>
 
+#include "omnister/common/contained_path.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/image_file.h"
 #include "omnister/common/image_motion.h"
 #include "omnister/common/numbers.h"
+#include "omnister/lens/lens_store.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/parameters.h"
@@ -42,6 +44,7 @@ ScanParameters loadScanParameters(const ros::NodeHandle& private_node) {
   p.still_px = source.number("still_px", p.still_px, 0.0, 1000.0, "px");
   p.stop_timeout_s = source.number("stop_timeout", p.stop_timeout_s, 0.1, 3600.0, "s");
   p.max_wait_s = source.number("max_wait", p.max_wait_s, 0.05, 60.0, "s");
+  p.folder = source.text("folder", "");
   source.warnUnknown();
   return p;
 }
@@ -193,7 +196,9 @@ void ScanServer::run(const ScanGoal& goal) {
   scan_ = std::to_string(ros::Time::now().toNSec());
   const std::vector<double> stops = stopsOf(goal);
   if (!goal.folder.empty()) {
-    const fs::path folder = goal.folder;
+    const fs::path root =
+        parameters_.folder.empty() ? LensStore({}).folder() / "scans" : parameters_.folder;
+    const fs::path folder = pathInside(root, goal.folder, "scan", "folder");
     std::error_code error;
     if (fs::exists(folder, error) && !fs::is_empty(folder, error)) {
       throw InputError("scan", "folder", "\"" + printable(goal.folder) + "\" is not empty");

@@ -1,8 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/ros/sim_rig.h"
 
+#include <cmath>
+#include <iterator>
+#include <sstream>
 #include <vector>
 
+#include "omnister/common/error.h"
+#include "omnister/common/numbers.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/parameters.h"
@@ -14,6 +19,14 @@ namespace {
 std::string defaultPort() {
   const char* runtime = getenv("XDG_RUNTIME_DIR");
   return std::string(runtime && *runtime ? runtime : "/tmp") + "/omnister_stage";
+}
+
+/// A number among the words of a fault. @throws InputError where there is none
+double numberOf(const std::vector<std::string>& words, std::size_t index) {
+  const auto numbers = index < words.size() ? parseNumbers(words[index]) : std::nullopt;
+  if (!numbers || numbers->size() != 1 || !(numbers->front() >= 0.0 && numbers->front() <= 1e5))
+    throw InputError("~fault", "", "expected a number from 0 to 100000");
+  return numbers->front();
 }
 
 }  // namespace
@@ -89,17 +102,21 @@ SimRig::SimRig(const ros::NodeHandle& private_node, const SimRigParameters& para
   const auto renderer =
       std::make_shared<sim::Renderer>(*truth.lens, truth.image_size, parameters.render.threads);
   const Eigen::Vector3d direction = opticalInLink().linear().transpose() * parameters.axis;
-  server_ = std::make_unique<sim::GigeServer>(
-      camera,
-      [renderer, scene, with_board, direction, board = board_, stage = stage_,
-       pose = parameters.camera_pose, render = parameters.render](device::Stamp time) mutable {
-        const int shown = board->load();
-        const sim::ScenePtr& seen = shown < 0 ? scene : with_board[static_cast<std::size_t>(shown)];
-        ++render.seed;
-        const Pose T_world_optical =
-            pose * Eigen::Translation3d(direction * stage->truePosition(time));
-        return renderer->render(*seen, T_world_optical, render).image;
-      });
+  const sim::DrawFrame draw = [renderer, scene, with_board, direction, board = board_,
+                               stage = stage_, view = view_, pose = parameters.camera_pose,
+                               render = parameters.render](device::Stamp time) mutable {
+    if (view->frozen) throw Error("the camera is frozen");
+    const int shown = board->load();
+    const sim::ScenePtr& seen = shown < 0 ? scene : with_board[static_cast<std::size_t>(shown)];
+    ++render.seed;
+    const double slipped = view->slipped_at;
+    const double position = std::isnan(slipped) ? stage->truePosition(time) : slipped;
+    const Pose T_world_optical = pose * Eigen::Translation3d(direction * position);
+    return renderer->render(*seen, T_world_optical, render).image;
+  };
+  power_up_ = [camera, draw] { return std::make_unique<sim::GigeServer>(camera, draw); };
+  server_ = power_up_();
+  fault_subscriber_ = ros::NodeHandle(private_node).subscribe("fault", 10, &SimRig::onFault, this);
   if (!with_board.empty()) {
     using Request = std_srvs::SetBool::Request;
     using Response = std_srvs::SetBool::Response;
@@ -113,6 +130,63 @@ SimRig::SimRig(const ros::NodeHandle& private_node, const SimRigParameters& para
           response.success = true;
           return true;
         });
+  }
+}
+
+void SimRig::onFault(const std_msgs::String& message) {
+  try {
+    std::istringstream text(message.data.substr(0, 100));
+    const std::vector<std::string> words{std::istream_iterator<std::string>(text), {}};
+    if (words.size() < 2)
+      throw InputError("~fault", "", "expected a part and what is wrong with it");
+    words[0] == "camera" ? cameraFault(words) : stageFault(words);
+    ROS_WARN("fault: %s", printable(message.data, 100).c_str());
+  } catch (const std::exception& error) {
+    ROS_ERROR("fault \"%s\": %s", printable(message.data, 100).c_str(), error.what());
+  }
+}
+
+void SimRig::cameraFault(const std::vector<std::string>& words) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  const std::string& what = words[1];
+  if (what == "freeze" || what == "thaw") {
+    view_->frozen = what == "freeze";
+  } else if (what == "off") {
+    server_.reset();
+  } else if (what == "on") {
+    if (!server_) server_ = power_up_();
+  } else if (what == "loss" && server_) {
+    server_->setPacketLoss(numberOf(words, 2));
+  } else if (what == "size" && server_) {
+    server_->setRegion(
+        {static_cast<int>(numberOf(words, 2)), static_cast<int>(numberOf(words, 3))});
+  } else {
+    throw InputError("~fault", "camera", "cannot do that now");
+  }
+}
+
+void SimRig::stageFault(const std::vector<std::string>& words) {
+  const std::string& what = words[1];
+  if (what == "stall") {
+    stage_->stall();
+  } else if (what == "reset") {
+    controller_->powerCycle();
+  } else if (what == "unplug") {
+    controller_->unplug();
+  } else if (what == "plug") {
+    controller_->plugIn();
+  } else if (what == "freeze" || what == "thaw") {
+    controller_->freeze(what == "freeze");
+  } else if (what == "garble") {
+    sim::WireFaults faults;
+    faults.garble = numberOf(words, 2);
+    controller_->setFaults(faults);
+  } else if (what == "slip") {
+    view_->slipped_at = stage_->truePosition(device::now());
+  } else if (what == "grip") {
+    view_->slipped_at = std::nan("");
+  } else {
+    throw InputError("~fault", "", "is none of those of a camera or a stage");
   }
 }
 

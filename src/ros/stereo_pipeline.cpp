@@ -14,9 +14,11 @@
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
 #include "omnister/common/image_file.h"
+#include "omnister/common/numbers.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/lens_markers.h"
+#include "omnister/ros/live_parameters.h"
 #include "omnister/ros/stereo_messages.h"
 #include "omnister/stereo/cloud.h"
 #include "omnister/view/epipolar_overlay.h"
@@ -29,6 +31,8 @@ namespace {
 constexpr std::uint32_t kLensesWaiting = 16;
 constexpr std::size_t kMostClicked = 8;  // pixels of the overlay; the oldest go first
 constexpr double kWarningPeriod = 5.0;   // [s]
+constexpr double kQuiet = 0.7;           // [s] without a cloud that call for no reason
+constexpr double kFuture = 2.0;          // [s] that tf may run ahead of the clock
 constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said why
 
 cv::Mat loadMask(const std::string& path) {
@@ -97,6 +101,8 @@ class Laps {
   ros::SteadyTime last_ = ros::SteadyTime::now();
   std::map<std::string, double> seconds_;
 };
+
+std::string tenths(double value) { return formatNumber(std::round(10.0 * value) / 10.0); }
 
 std::int64_t nowNanoseconds() { return static_cast<std::int64_t>(ros::Time::now().toNSec()); }
 
@@ -233,6 +239,7 @@ StereoPipeline::~StereoPipeline() {
 void StereoPipeline::configure(StereoConfig& config) {
   std::lock_guard<std::mutex> lock(mutex_);
   const StereoConfig before = toConfig(live_);
+  keepFinite(config, before);
   // Whoever asks is told what became of it: what contradicts itself stays as it was.
   if (!(config.min_baseline < config.max_baseline)) {
     ROS_WARN("min_baseline %g m is not below max_baseline %g m: both stay", config.min_baseline,
@@ -339,12 +346,21 @@ void StereoPipeline::subscribe() {
     reason_ = "no image on " + eyes_[0].topic;
   }
   const image_transport::TransportHints hints("raw", ros::TransportHints().tcpNoDelay());
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    for (Eye& eye : eyes_) eye.missing.reset();
+    last_image_ = {};
+  }
   if (parameters_.rig) {
     left_subscriber_ =
         std::make_unique<image_transport::SubscriberFilter>(transport_, "left/image_raw", 4, hints);
     right_subscriber_ = std::make_unique<image_transport::SubscriberFilter>(
         transport_, "right/image_raw", 4, hints);
     SyncPolicy policy(8);
+    left_subscriber_->registerCallback(
+        [this](const sensor_msgs::ImageConstPtr& image) { count(*image, 0); });
+    right_subscriber_->registerCallback(
+        [this](const sensor_msgs::ImageConstPtr& image) { count(*image, 1); });
     policy.setMaxIntervalDuration(ros::Duration(parameters_.max_skew));
     policy.setReset(true);
     synchronizer_ = std::make_unique<message_filters::Synchronizer<SyncPolicy>>(
@@ -367,7 +383,21 @@ void StereoPipeline::unsubscribe() {
   subscribed_ = false;
   std::lock_guard<std::mutex> lock(mutex_);
   pairing_.reset("nobody listens");
+  if (pending_) ++drops_["nobody listens"];
   pending_.reset();
+}
+
+void StereoPipeline::count(const sensor_msgs::Image& image, std::size_t eye) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  ++eyes_[eye].received;
+  if (eye == 0) {
+    const ros::SteadyTime now = ros::SteadyTime::now();
+    if (!last_image_.isZero()) image_interval_ = (now - last_image_).toSec();
+    last_image_ = now;
+  }
+  // More came than could be taken in: the older ones went.
+  if (const std::uint32_t missing = eyes_[eye].missing.before(image.header))
+    drops_["missed"] += missing;
 }
 
 void StereoPipeline::drop(const std::string& name, const std::string& reason, bool fault) {
@@ -426,6 +456,7 @@ cv::Size StereoPipeline::expectedSize(std::size_t eye) const {
 }
 
 void StereoPipeline::onImage(const sensor_msgs::ImageConstPtr& image) {
+  count(*image, 0);
   try {
     checkFrame(*image, expectedSize(0), eyes_[0].topic);
   } catch (const std::exception& error) {
@@ -480,7 +511,20 @@ std::optional<Pose> StereoPipeline::rigPose(const sensor_msgs::Image& left,
   }
 }
 
-PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t stamp_ns) const {
+bool StereoPipeline::forgetFuture(const std::string& frame_id) {
+  // A single transform from the future pushes all others out of the buffer until its time has come.
+  try {
+    const ros::Time latest =
+        tf_buffer_.lookupTransform(parameters_.fixed_frame, frame_id, ros::Time(0)).header.stamp;
+    if ((latest - ros::Time::now()).toSec() < kFuture) return false;
+    tf_buffer_.clear();
+    return true;
+  } catch (const tf2::TransformException&) {
+    return false;
+  }
+}
+
+PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t stamp_ns) {
   PoseAnswer answer;
   // tf2 takes time 0 for "the latest".
   if (stamp_ns <= 0) {
@@ -496,6 +540,7 @@ PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t 
   } catch (const tf2::ExtrapolationException& error) {
     answer.reason = printable(error.what(), 300);
     const bool past = answer.reason.find("into the past") != std::string::npos;
+    if (past && forgetFuture(frame_id)) answer.reason = "tf ran ahead of the clock: it starts anew";
     answer.state = past ? PoseAnswer::State::kNever : PoseAnswer::State::kLater;
   } catch (const tf2::TransformException& error) {
     // A frame that nobody has published yet may still come.
@@ -520,6 +565,7 @@ std::optional<StereoSet> StereoPipeline::nextJob() {
   if (stopping_) return std::nullopt;
   if (!parameters_.rig) pollPairing();
   if (!pending_ || due_in() > 0.0) return std::nullopt;
+  in_work_ = true;
   return std::exchange(pending_, std::nullopt);
 }
 
@@ -551,6 +597,7 @@ void StereoPipeline::run() {
     std::string why;
     {
       std::lock_guard<std::mutex> lock(mutex_);
+      in_work_ = false;
       if (stopping_) return;
       silence = (ros::SteadyTime::now() - last_cloud_).toSec();
       const auto said = warned_.find("silence");
@@ -652,6 +699,22 @@ void StereoPipeline::process(const StereoSet& job) {
   reason_.clear();
 }
 
+std::string StereoPipeline::whySilent() const {
+  const ros::SteadyTime now = ros::SteadyTime::now();
+  const double silence = (now - last_cloud_).toSec();
+  // Before the second image nobody knows how fast they come.
+  const double frames = image_interval_ > 0.0 ? 3.0 * image_interval_ : kWarningPeriod;
+  const double images = last_image_.isZero() ? silence : (now - last_image_).toSec();
+  if (images > std::max(kQuiet, frames))
+    return "no image for " + tenths(images) + " s on " + eyes_[0].topic;
+  const auto matching = last_statistics_.seconds.find("total");
+  const double seconds = matching != last_statistics_.seconds.end() ? matching->second : 0.0;
+  const bool patient = pairing_.moving() || in_work_ || pending_;
+  const double usual = std::max({kQuiet, frames, 2.0 * seconds + live_.min_period});
+  if (silence <= (patient ? std::max(kWarningPeriod, usual) : usual)) return {};
+  return reason_.empty() ? "for " + tenths(silence) + " s" : reason_;
+}
+
 void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
   bool subscribed = false;
   {
@@ -659,20 +722,22 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
     subscribed = subscribed_;
   }
   std::lock_guard<std::mutex> lock(mutex_);
-  const double silence = (ros::SteadyTime::now() - last_cloud_).toSec();
+  const std::string silent = whySilent();
   using diagnostic_msgs::DiagnosticStatus;
   if (!subscribed)
     status.summary(DiagnosticStatus::OK, "idle: nobody listens");
-  else if (silence < kWarningPeriod && clouds_ > 0 && last_statistics_.valid == 0)
+  else if (!silent.empty())
+    status.summary(DiagnosticStatus::WARN, "no cloud: " + printable(silent, 300));
+  else if (clouds_ > 0 && last_statistics_.valid == 0)
     status.summary(DiagnosticStatus::WARN,
                    "clouds are empty: every pixel is rejected, most by the test '" +
                        mostRejecting(last_statistics_) + "'");
-  else if (silence < kWarningPeriod)
-    status.summary(DiagnosticStatus::OK, "running");
   else
-    status.summary(DiagnosticStatus::WARN, "no cloud: " + printable(reason_, 300));
-  for (const Eye& eye : eyes_)
+    status.summary(DiagnosticStatus::OK, "running");
+  for (const Eye& eye : eyes_) {
     status.add("lens of " + eye.topic, eye.lens ? std::string(eye.lens->lens->model()) : "none");
+    status.add("images of " + eye.topic, eye.received);
+  }
   status.add("clouds", clouds_);
   if (clouds_ > 0) {
     status.add("valid pixels", last_statistics_.valid);
@@ -684,6 +749,9 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
   if (pairing_.missedBaseline()) status.add("baseline missed [m]", *pairing_.missedBaseline());
   for (const auto& [name, count] : pairing_.counts()) status.add("frames, " + name, count);
   for (const auto& [name, count] : drops_) status.add("dropped, " + name, count);
+  // What is on its way: with these, every image is accounted for.
+  status.add("frames, waiting", pairing_.waitingFrames());
+  status.add("sets, waiting or matched", (pending_ ? 1 : 0) + (in_work_ ? 1 : 0));
 }
 
 }  // namespace omnister

@@ -10,6 +10,7 @@
 #include "omnister/common/error.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
+#include "omnister/ros/live_parameters.h"
 
 namespace omnister {
 namespace {
@@ -77,7 +78,8 @@ ViewServer::ViewServer(const ros::NodeHandle& node, const ros::NodeHandle& priva
     : parameters_(load(private_node)),
       node_(callbacks_.on(node)),
       transport_(node_),
-      config_(parameters_.view) {
+      config_(parameters_.view),
+      diagnostics_(node, private_node, private_node.getNamespace()) {
   if (!parameters_.lens.empty()) lens_ = readLensFile(parameters_.lens);
   config_server_ = std::make_unique<dynamic_reconfigure::Server<ViewConfig>>(
       config_mutex_, callbacks_.on(private_node));
@@ -96,17 +98,23 @@ ViewServer::ViewServer(const ros::NodeHandle& node, const ros::NodeHandle& priva
         "lens_model", kLensesWaiting,
         [this](const LensModelMessage::ConstPtr& message) { onLens(message); });
   }
+  diagnostics_.setHardwareID("none");
+  diagnostics_.add("view", this, &ViewServer::diagnose);
+  diagnostics_timer_ = node_.createSteadyTimer(
+      ros::WallDuration(1.0),
+      [this](const ros::SteadyTimerEvent&) { diagnostics_.force_update(); });
   callbacks_.start();
 }
 
 ViewServer::~ViewServer() { callbacks_.stop(); }
 
 void ViewServer::configure(ViewConfig& config) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  keepFinite(config, config_);
   if (config.projection != "cylindrical" && config.projection != "equirectangular")
     config.projection = "pinhole";
   // Whoever asked sees what became of it.
   if (config.projection == "pinhole") config.hfov = std::min(config.hfov, kWidestPinhole);
-  const std::lock_guard<std::mutex> lock(mutex_);
   config_ = config;
   maps_.reset();
   if (!camera_frame_.empty()) frameFor(camera_frame_);
@@ -116,6 +124,10 @@ void ViewServer::onConnection() {
   try {
     const bool images = image_publisher_.getNumSubscribers() > 0;
     if (images && !image_subscriber_) {
+      {
+        const std::lock_guard<std::mutex> tally(mutex_);
+        images_.numbers.reset();
+      }
       image_subscriber_ = transport_.subscribe(
           "image_raw", 1, [this](const sensor_msgs::ImageConstPtr& image) { onImage(image); },
           ros::VoidPtr(),
@@ -126,6 +138,10 @@ void ViewServer::onConnection() {
     }
     const bool depths = depth_publisher_.getNumSubscribers() > 0;
     if (depths && !range_subscriber_) {
+      {
+        const std::lock_guard<std::mutex> tally(mutex_);
+        ranges_.numbers.reset();
+      }
       range_subscriber_ = node_.subscribe<sensor_msgs::Image>(
           "range", 1, [this](const sensor_msgs::ImageConstPtr& range) { onRange(range); },
           ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay());
@@ -138,8 +154,23 @@ void ViewServer::onConnection() {
   }
 }
 
-void ViewServer::say(const std::exception& error) const {
+void ViewServer::Tally::take(const std_msgs::Header& header) {
+  ++received;
+  missed += numbers.before(header);
+}
+
+void ViewServer::say(const std::exception& error) {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    problem_ = error.what();
+  }
   ROS_WARN_THROTTLE(kWarningPeriod, "no view: %s", printable(error.what(), 500).c_str());
+}
+
+void ViewServer::drop(Tally& tally, const std::exception& error) {
+  say(error);
+  const std::lock_guard<std::mutex> lock(mutex_);
+  ++tally.failed;
 }
 
 void ViewServer::onLens(const LensModelMessage::ConstPtr& message) {
@@ -211,6 +242,7 @@ void ViewServer::onImage(const sensor_msgs::ImageConstPtr& image) {
     sensor_msgs::CameraInfoPtr camera_info;
     {
       const std::lock_guard<std::mutex> lock(mutex_);
+      images_.take(image->header);
       Maps& maps = this->maps();
       checkFrame(*image, maps.lens.image_size, node_.resolveName("image_raw"));
       if (!maps.image)
@@ -228,13 +260,20 @@ void ViewServer::onImage(const sensor_msgs::ImageConstPtr& image) {
           boost::make_shared<sensor_msgs::CameraInfo>(info(maps.geometry, message->header));
     }
     image_publisher_.publish(message, camera_info);
+    const std::lock_guard<std::mutex> lock(mutex_);
+    ++images_.published;
+    problem_.clear();
   } catch (const std::exception& error) {
-    say(error);
+    drop(images_, error);
   }
 }
 
 void ViewServer::onRange(const sensor_msgs::ImageConstPtr& range) {
   try {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      ranges_.take(range->header);
+    }
     checkImage(*range);
     if (range->encoding != enc::TYPE_32FC1)
       throw InputError(node_.resolveName("range"), "encoding",
@@ -255,8 +294,30 @@ void ViewServer::onRange(const sensor_msgs::ImageConstPtr& range) {
           boost::make_shared<sensor_msgs::CameraInfo>(info(maps.geometry, message->header));
     }
     depth_publisher_.publish(message, camera_info);
+    const std::lock_guard<std::mutex> lock(mutex_);
+    ++ranges_.published;
+    problem_.clear();
   } catch (const std::exception& error) {
-    say(error);
+    drop(ranges_, error);
+  }
+}
+
+void ViewServer::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
+  const bool images_wanted = image_publisher_.getNumSubscribers() > 0;
+  const bool depths_wanted = depth_publisher_.getNumSubscribers() > 0;
+  const std::lock_guard<std::mutex> lock(mutex_);
+  using diagnostic_msgs::DiagnosticStatus;
+  if (!images_wanted && !depths_wanted)
+    status.summary(DiagnosticStatus::OK, "idle: nobody listens");
+  else if (!problem_.empty())
+    status.summary(DiagnosticStatus::WARN, "no view: " + printable(problem_, 300));
+  else
+    status.summary(DiagnosticStatus::OK, "running");
+  for (const auto& [name, tally] : {std::make_pair("images", &images_), {"ranges", &ranges_}}) {
+    status.add(std::string(name) + " received", tally->received);
+    status.add(std::string(name) + " published", tally->published);
+    status.add(std::string(name) + " missed", tally->missed);
+    status.add(std::string(name) + " failed", tally->failed);
   }
 }
 

@@ -337,6 +337,13 @@ class GigeServer::Impl {
   void setExposure(double us) {
     set(ARV_FAKE_CAMERA_REGISTER_EXPOSURE_TIME_US, static_cast<guint32>(std::lround(us)));
   }
+  void setRegion(cv::Size size) {
+    const auto side = [](int wanted, int most) {
+      return static_cast<guint32>(std::clamp(wanted, 2, most));
+    };
+    set(ARV_FAKE_CAMERA_REGISTER_WIDTH, side(size.width, options_.size.width));
+    set(ARV_FAKE_CAMERA_REGISTER_HEIGHT, side(size.height, options_.size.height));
+  }
   void pulseLine0() { line0_ = true; }
   std::string problem() const {
     const std::lock_guard<std::mutex> lock(mutex_);
@@ -532,6 +539,7 @@ GigeServer::~GigeServer() = default;
 std::string GigeServer::device() const { return "aravis:" + impl_->options().serial; }
 void GigeServer::setPacketLoss(double share) { impl_->wire().setLoss(share); }
 void GigeServer::setExposure(double us) { impl_->setExposure(us); }
+void GigeServer::setRegion(cv::Size size) { impl_->setRegion(size); }
 void GigeServer::pulseLine0() { impl_->pulseLine0(); }
 std::uint64_t GigeServer::framesSent() const { return impl_->wire().framesSent(); }
 std::uint64_t GigeServer::packetsSentAgain() const { return impl_->wire().packetsSentAgain(); }

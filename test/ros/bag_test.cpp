@@ -1,63 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
 // `omnister bag`, on recordings written here. No master.
 #include <gmock/gmock.h>
-#include <ros/time.h>
-#include <rosbag/bag.h>
-#include <tf2_msgs/TFMessage.h>
 
 #include <filesystem>
 #include <nlohmann/json.hpp>
 
 #include "command_run.h"
 #include "omnister/common/file_io.h"
-#include "omnister/ros/conversions.h"
 #include "omnister/stereo/cloud.h"
-#include "ros/rendered_views.h"
+#include "ros/recorded_rig.h"
 #include "temporary_folder.h"
 
 namespace omnister {
 namespace {
 
 namespace fs = std::filesystem;
+using test::kBegin;
+using test::Recording;
 using test::run;
 using test::views;
 using testing::AllOf;
 using testing::HasSubstr;
 using Json = nlohmann::json;
-
-const ros::Time kBegin(1000.0);
-
-/// A stage that goes to and fro, resting at each end, with an image a second.
-class Recording {
- public:
-  explicit Recording(const fs::path& path) : bag_(path.string(), rosbag::bagmode::Write) {}
-
-  void lens(const LensFile& file) {
-    std_msgs::Header header;
-    header.stamp = kBegin;
-    header.frame_id = "camera_optical";
-    bag_.write("/camera/lens_model", kBegin, toLensModelMessage(file, header));
-  }
-  /// Rests at `x` [m] and takes the image belonging there.
-  void frame(int number, double x, const cv::Mat& image) {
-    const ros::Time stamp = kBegin + ros::Duration(number + 1.0);
-    for (const double offset : {-0.2, -0.1, 0.0, 0.1, 0.2}) {
-      tf2_msgs::TFMessage transforms;
-      const ros::Time time = stamp + ros::Duration(offset);
-      transforms.transforms = {toTransformStamped(Pose(Eigen::Translation3d(x, 0, 0)), time,
-                                                  "stage_base", "camera_optical")};
-      bag_.write("/tf", time, transforms);
-    }
-    const sensor_msgs::ImagePtr message = toImage(image, "bgr8");
-    message->header.stamp = stamp;
-    message->header.frame_id = "camera_optical";
-    bag_.write("/camera/image_raw", stamp, message);
-  }
-  rosbag::Bag& bag() { return bag_; }
-
- private:
-  rosbag::Bag bag_;
-};
 
 constexpr int kFrames = 6;
 
@@ -66,11 +30,7 @@ class Bag : public testing::Test {
   std::string path(const std::string& name) const { return (folder_.path() / name).string(); }
 
   std::string recorded() const {
-    Recording recording(path("run.bag"));
-    recording.lens(views().lens);
-    for (int i = 0; i < kFrames; ++i)
-      recording.frame(i, i % 2 == 0 ? 0.0 : test::kBaseline,
-                      i % 2 == 0 ? views().left : views().right);
+    test::recordRoom(path("run.bag"), kFrames);
     return path("run.bag");
   }
 

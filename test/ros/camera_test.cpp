@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <gmock/gmock.h>
+#include <ros/callback_queue.h>
 #include <tf2_ros/buffer.h>
 #include <tf2_ros/transform_listener.h>
 
@@ -12,6 +13,8 @@
 #include <set>
 #include <thread>
 
+#include "child_process.h"
+#include "omnister/common/file_io.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/ros/camera_driver.h"
 #include "omnister/ros/conversions.h"
@@ -34,6 +37,7 @@ struct FakeState {
   std::atomic<std::uint64_t> skip{0};
   std::shared_ptr<device::FramePool> pool;
   std::optional<device::SensorRegion> region;
+  cv::Size size{8, 6};
   std::mutex mutex;
   std::set<const std::uint8_t*> places;
 };
@@ -58,7 +62,7 @@ class FakeCamera : public device::Camera {
       const std::lock_guard<std::mutex> lock(state_->mutex);
       state_->places.insert(frame.image.data);
     } else {
-      frame.image = cv::Mat(6, 8, CV_8UC1, cv::Scalar(7));
+      frame.image = cv::Mat(state_->size, CV_8UC1, cv::Scalar(7));
     }
     frame.region = state_->region;
     frame.encoding = "mono8";
@@ -196,6 +200,45 @@ TEST_F(CameraTest, ImageAndInformationHaveTheSameHeaderAndNoneIsLost) {
     EXPECT_EQ(got[i]->data[0], got[i - 1]->data[0] + 1);
     EXPECT_NEAR((got[i]->header.stamp - got[i - 1]->header.stamp).toSec(), 0.02, 1e-6);
   }
+}
+
+TEST_F(CameraTest, SlowListenersStallNobody) {
+  // 300 images of a megabyte, which no socket holds.
+  constexpr std::uint64_t kImages = 300;
+  state_.size = {1024, 1024};
+  openFake();
+  const std::string topic = node_.resolveName("image_raw");
+  const std::string heard = (folder_.path() / "heard").string();
+  // One in another process that stands still, and one in this process that never takes what waits
+  // for it.
+  const test::ChildProcess stopped({"rostopic", "hz", topic}, heard);
+  ASSERT_TRUE(
+      eventually([&] { return readFile(heard).find("average rate") != std::string::npos; }, 60.0));
+  stopped.signal(SIGSTOP);
+  ros::CallbackQueue never;
+  ros::NodeHandle idle(node_);
+  idle.setCallbackQueue(&never);
+  const boost::function<void(const sensor_msgs::ImageConstPtr&)> ignore =
+      [](const sensor_msgs::ImageConstPtr&) {};
+  const ros::Subscriber sleeper = idle.subscribe<sensor_msgs::Image>("image_raw", 5, ignore);
+  std::atomic<std::uint64_t> count{0}, missed{0}, last{0};
+  const ros::Subscriber quick = node_.subscribe<sensor_msgs::Image>(
+      "image_raw", 1000, [&](const sensor_msgs::ImageConstPtr& image) {
+        if (last != 0) missed += image->header.seq - last - 1;
+        last = image->header.seq;
+        ++count;
+      });
+  ASSERT_TRUE(eventually([&] { return count >= 20; }, 60.0));
+  const auto resident = [] {
+    std::ifstream file("/proc/self/statm");
+    std::uint64_t all = 0, pages = 0;
+    file >> all >> pages;
+    return pages * 4096 >> 20;
+  };
+  const std::uint64_t before = resident();
+  EXPECT_TRUE(eventually([&] { return count >= kImages; }, 60.0));
+  EXPECT_EQ(missed, 0U);
+  EXPECT_LT(resident(), before + 50) << "megabytes";
 }
 
 TEST_F(CameraTest, ComesBackAfterALoss) {

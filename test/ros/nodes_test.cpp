@@ -1,14 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
 // Node and nodelet as they are started by launch files.
+#include <XmlRpcClient.h>
 #include <nodelet/loader.h>
+#include <omnister/CalibrateAction.h>
+#include <ros/network.h>
 #include <sensor_msgs/CameraInfo.h>
 #include <sensor_msgs/Image.h>
 #include <sensor_msgs/PointCloud2.h>
+#include <signal.h>
 #include <tf2_ros/buffer.h>
+#include <tf2_ros/transform_broadcaster.h>
 #include <tf2_ros/transform_listener.h>
 
 #include <atomic>
+#include <thread>
 
+#include "omnister/lens/lens_file.h"
 #include "omnister/ros/callback_threads.h"
 #include "omnister/ros/conversions.h"
 #include "ros/ros_test.h"
@@ -18,6 +25,23 @@ namespace {
 
 using test::Collector;
 using test::eventually;
+
+/// Of a node, asked of itself; 0 when it does not answer.
+pid_t processOf(const std::string& name) {
+  XmlRpc::XmlRpcValue arguments, result, payload;
+  arguments[0] = ros::this_node::getName();
+  arguments[1] = name;
+  std::string host;
+  std::uint32_t port = 0;
+  if (!ros::master::execute("lookupNode", arguments, result, payload, false) ||
+      !ros::network::splitURI(payload, host, port))
+    return 0;
+  XmlRpc::XmlRpcValue caller;
+  caller[0] = ros::this_node::getName();
+  XmlRpc::XmlRpcClient client(host.c_str(), static_cast<int>(port), "/");
+  if (!client.execute("getPid", caller, result) || client.isFault()) return 0;
+  return static_cast<int>(result[2]);
+}
 
 class RunningCamera : public testing::TestWithParam<const char*> {};
 
@@ -77,70 +101,124 @@ TEST(CallbackThreads, NoCallbackRunsOnceTheyAreStopped) {
   }
 }
 
-TEST(CameraNodelet, IsLoadedAndUnloadedWhileItStreams) {
-  const std::string name = "/come_and_go/camera";
-  ros::NodeHandle parameters(name);
-  parameters.setParam("device", "replay:" OMNISTER_SOURCE_DIR "/test/data/replay");
-  parameters.setParam("loop", true);
-  nodelet::Loader loader(false);
-  Collector<sensor_msgs::Image> images(ros::NodeHandle("/come_and_go"), "image_raw");
-  for (int round = 0; round < 8; ++round) {
-    const std::size_t before = images.size();
-    ASSERT_TRUE(loader.load(name, "omnister/CameraNodelet", {}, {}));
-    // Every other time it goes before its first frame.
-    if (round % 2 == 0) {
-      ASSERT_TRUE(eventually([&] { return images.size() > before; })) << round;
+/// All that a nodelet in the namespace /busy can hear, far faster than any rig says it.
+class Flood {
+ public:
+  Flood() : node_("/busy") {
+    images_ = node_.advertise<sensor_msgs::Image>("image_raw", 10);
+    ranges_ = node_.advertise<sensor_msgs::Image>("range", 10);
+    lenses_ = node_.advertise<LensModelMessage>("lens_model", 10);
+    goals_ = node_.advertise<CalibrateActionGoal>("calibrate/goal", 10);
+    thread_ = std::thread([this] { run(); });
+  }
+  ~Flood() {
+    stop_ = true;
+    thread_.join();
+  }
+
+ private:
+  void run() {
+    std_msgs::Header header;
+    header.frame_id = "busy_optical";
+    LensFile lens = readLensFile(OMNISTER_SOURCE_DIR "/test/data/replay/lens.yaml");
+    for (int i = 0; !stop_; ++i) {
+      header.stamp = ros::Time::now();
+      const Pose place(Eigen::Translation3d(0.02 * (i / 8 % 2), 0.0, 0.0));
+      transforms_.sendTransform(
+          toTransformStamped(place, header.stamp, "busy_base", header.frame_id));
+      sensor_msgs::ImagePtr image =
+          toImage(cv::Mat(lens.image_size, CV_8UC1, cv::Scalar(i % 256)), "mono8");
+      image->header = header;
+      images_.publish(image);
+      sensor_msgs::ImagePtr range =
+          toImage(cv::Mat(lens.image_size, CV_32FC1, cv::Scalar(1.0)), "32FC1");
+      range->header = header;
+      ranges_.publish(range);
+      if (i % 4 == 0) {
+        lens.camera_name = "lens" + std::to_string(i);
+        lenses_.publish(toLensModelMessage(lens, header));
+      }
+      if (i % 16 == 0) goals_.publish(CalibrateActionGoal());
+      ros::WallDuration(0.001).sleep();
     }
-    ASSERT_TRUE(loader.unload(name));
-    ASSERT_TRUE(eventually([&] { return !images.connected(); })) << round;
+  }
+
+  ros::NodeHandle node_;
+  ros::Publisher images_, ranges_, lenses_, goals_;
+  tf2_ros::TransformBroadcaster transforms_;
+  std::atomic<bool> stop_{false};
+  std::thread thread_;
+};
+
+/// Loads and unloads a nodelet many times while all its inputs come in and somebody listens to
+/// what it makes of them; mostly it goes as soon as it is there.
+template <typename Output>
+void comeAndGo(const std::string& name, const std::string& type, const std::string& output,
+               int rounds = 100) {
+  nodelet::Loader loader(false);
+  const Flood flood;
+  Collector<Output> outputs(ros::NodeHandle("/busy"), output);
+  for (int round = 0; round < rounds; ++round) {
+    const std::size_t before = outputs.size();
+    ASSERT_TRUE(loader.load(name, type, {}, {})) << round;
+    if (round % 10 == 0) {
+      ASSERT_TRUE(eventually([&] { return outputs.size() > before; })) << round;
+    }
+    ASSERT_TRUE(loader.unload(name)) << round;
+    outputs.clear();
   }
   EXPECT_TRUE(loader.listLoadedNodelets().empty());
+  EXPECT_TRUE(eventually([&] { return !outputs.connected(); }));
 }
 
-TEST(StereoNodelet, IsLoadedAndUnloadedWhileSomebodyListens) {
-  const std::string name = "/come_and_go/stereo";
-  nodelet::Loader loader(false);
-  Collector<sensor_msgs::PointCloud2> clouds(ros::NodeHandle("/come_and_go"), "points2");
-  for (int round = 0; round < 8; ++round) {
-    ASSERT_TRUE(loader.load(name, "omnister/StereoNodelet", {}, {}));
-    if (round % 2 == 0) {
-      ASSERT_TRUE(eventually([&] { return clouds.connected(); })) << round;
-    }
-    ASSERT_TRUE(loader.unload(name));
-    ASSERT_TRUE(eventually([&] { return !clouds.connected(); })) << round;
-  }
-  ros::NodeHandle(name).setParam("matcher", "magic");
-  EXPECT_FALSE(loader.load(name, "omnister/StereoNodelet", {}, {}));
+TEST(CameraNodelet, ComesAndGoesAHundredTimes) {
+  ros::NodeHandle parameters("/busy/camera");
+  parameters.setParam("device", "replay:" OMNISTER_SOURCE_DIR "/test/data/replay");
+  parameters.setParam("loop", true);
+  parameters.setParam("frame_id", "busy_optical");
+  // The flood speaks on image_raw too.
+  comeAndGo<sensor_msgs::CameraInfo>("/busy/camera", "omnister/CameraNodelet", "camera_info");
 }
 
-TEST(CalibrationNodelet, IsLoadedAndUnloaded) {
-  const std::string name = "/come_and_go/calibration";
-  ros::NodeHandle parameters(name);
-  nodelet::Loader loader(false);
+TEST(StereoNodelet, ComesAndGoesAHundredTimes) {
+  ros::NodeHandle parameters("/busy/stereo");
+  parameters.setParam("fixed_frame", "busy_base");
+  parameters.setParam("settle_time", 0.0);
+  comeAndGo<sensor_msgs::PointCloud2>("/busy/stereo", "omnister/StereoNodelet", "points2");
+  parameters.setParam("matcher", "magic");
+  EXPECT_FALSE(nodelet::Loader(false).load("/busy/stereo", "omnister/StereoNodelet", {}, {}));
+}
+
+TEST(CalibrationNodelet, ComesAndGoesAHundredTimes) {
+  ros::NodeHandle parameters("/busy/calibration");
   // The target is required.
-  EXPECT_FALSE(loader.load(name, "omnister/CalibrationNodelet", {}, {}));
+  EXPECT_FALSE(
+      nodelet::Loader(false).load("/busy/calibration", "omnister/CalibrationNodelet", {}, {}));
   parameters.setParam("target", OMNISTER_SOURCE_DIR "/config/demo/target.yaml");
   parameters.setParam("store", ::testing::TempDir());
-  for (int round = 0; round < 8; ++round) {
-    ASSERT_TRUE(loader.load(name, "omnister/CalibrationNodelet", {}, {})) << round;
-    ASSERT_TRUE(loader.unload(name));
-  }
+  comeAndGo<CalibrateActionFeedback>("/busy/calibration", "omnister/CalibrationNodelet",
+                                     "calibrate/feedback");
 }
 
-TEST(ViewNodelet, IsLoadedAndUnloadedWhileSomebodyListens) {
-  const std::string name = "/come_and_go/view_node";
-  nodelet::Loader loader(false);
-  Collector<sensor_msgs::Image> views(ros::NodeHandle("/come_and_go"), "view/image_raw");
-  for (int round = 0; round < 8; ++round) {
-    ASSERT_TRUE(loader.load(name, "omnister/ViewNodelet", {}, {}));
-    if (round % 2 == 0) {
-      ASSERT_TRUE(eventually([&] { return views.connected(); })) << round;
-    }
-    ASSERT_TRUE(loader.unload(name));
-    ASSERT_TRUE(eventually([&] { return !views.connected(); })) << round;
+TEST(ViewNodelet, ComesAndGoesAHundredTimes) {
+  comeAndGo<sensor_msgs::Image>("/busy/view_node", "omnister/ViewNodelet", "view/image_raw");
+  comeAndGo<sensor_msgs::Image>("/busy/view_node", "omnister/ViewNodelet", "view/depth/image_raw",
+                                20);
+  ros::NodeHandle("/busy/view_node").setParam("hfov", -1.0);
+  EXPECT_FALSE(nodelet::Loader(false).load("/busy/view_node", "omnister/ViewNodelet", {}, {}));
+}
+
+TEST(NodeletManager, GetsItsNodeletsBackAfterItWasKilled) {
+  Collector<sensor_msgs::Image> images(ros::NodeHandle("/loaded"), "image_raw");
+  for (int round = 0; round < 2; ++round) {
+    ASSERT_TRUE(eventually([&] { return images.size() > 3; }, 60.0)) << round;
+    pid_t killed = 0;
+    ASSERT_TRUE(eventually([&] { return (killed = processOf("/manager")) > 0; }, 60.0));
+    ASSERT_EQ(kill(killed, SIGKILL), 0);
+    ASSERT_TRUE(eventually([&] { return kill(killed, 0) != 0; }, 60.0));
+    images.clear();
   }
-  ros::NodeHandle(name).setParam("hfov", -1.0);
-  EXPECT_FALSE(loader.load(name, "omnister/ViewNodelet", {}, {}));
+  EXPECT_TRUE(eventually([&] { return images.size() > 3; }, 60.0));
 }
 
 TEST(CameraNodelet, DoesNotStartWithBadParameters) {

@@ -45,6 +45,10 @@ class Collector {
     const std::lock_guard<std::mutex> lock(mutex_);
     return messages_.empty() ? nullptr : messages_.back();
   }
+  void clear() {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    messages_.clear();
+  }
   bool connected() const { return subscriber_.getNumPublishers() > 0; }
   void shutdown() { subscriber_.shutdown(); }
 

@@ -91,6 +91,7 @@ class Scan : public testing::Test {
     ScanParameters scan;
     scan.stop_timeout_s = 60.0;
     scan.max_wait_s = 10.0;
+    scan.folder = folder_.path();
     scan_ = std::make_unique<ScanServer>(node_, scan);
     ASSERT_TRUE(client_.waitForServer(ros::Duration(60.0)));
     ASSERT_TRUE(eventually([&] { return frames_.connected() && settled_.connected(); }, 60.0));
@@ -159,6 +160,12 @@ TEST_F(Scan, TagsImagesAtStopsAndKeepsThemAsARecording) {
   }
   EXPECT_EQ(run(goal), SimpleClientGoalState::ABORTED) << "the folder is full";
   EXPECT_THAT(client_.getResult()->message, HasSubstr("not empty"));
+  for (const char* elsewhere : {"/tmp/omnister_elsewhere", "../elsewhere", "a/../../elsewhere"}) {
+    goal.folder = elsewhere;
+    EXPECT_EQ(run(goal), SimpleClientGoalState::ABORTED);
+    EXPECT_THAT(client_.getResult()->message, HasSubstr("folder"));
+    EXPECT_FALSE(std::filesystem::exists(folder_.path() / elsewhere));
+  }
 
   goal.positions = {0.1, 0.31};
   goal.folder.clear();

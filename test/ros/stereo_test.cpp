@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <diagnostic_msgs/DiagnosticArray.h>
 #include <dynamic_reconfigure/Reconfigure.h>
 #include <geometry_msgs/Point.h>
 #include <geometry_msgs/PointStamped.h>
@@ -6,15 +7,15 @@
 #include <omnister/StageTimes.h>
 #include <sensor_msgs/PointCloud2.h>
 #include <tf2_ros/static_transform_broadcaster.h>
-#include <tf2_ros/transform_broadcaster.h>
-#include <unistd.h>
 #include <visualization_msgs/MarkerArray.h>
 
 #include <algorithm>
 #include <cmath>
 #include <filesystem>
 #include <limits>
+#include <map>
 #include <memory>
+#include <mutex>
 #include <opencv2/core.hpp>
 #include <opencv2/imgproc.hpp>
 
@@ -24,87 +25,22 @@
 #include "omnister/ros/stereo_messages.h"
 #include "omnister/ros/stereo_pipeline.h"
 #include "omnister/sim/renderer.h"
-#include "ros/rendered_views.h"
+#include "ros/moving_camera.h"
 #include "ros/ros_test.h"
 
 namespace omnister {
 namespace {
 
+using test::Camera;
 using test::Collector;
 using test::eventually;
 using test::kBaseline;
 using test::lensFile;
+using test::lensPath;
 using test::medianError;
+using test::parametersFor;
+using test::publishPair;
 using test::views;
-
-/// Its file, there as long as the tests run.
-const std::string& lensPath() {
-  struct Folder {
-    std::filesystem::path path = std::filesystem::temp_directory_path() /
-                                 ("omnister_stereo_test." + std::to_string(getpid()));
-    std::string file = (path / "lens.yaml").string();
-    Folder() {
-      std::filesystem::create_directories(path);
-      writeLensFile(file, lensFile());
-    }
-    ~Folder() { std::filesystem::remove_all(path); }
-  };
-  static const Folder folder;
-  return folder.file;
-}
-
-/// A camera on a stage as its messages show it.
-class Camera {
- public:
-  explicit Camera(const std::string& name)
-      : node_(name),
-        base_(name + "_base"),
-        optical_(name + "_optical"),
-        images_(node_.advertise<sensor_msgs::Image>("image_raw", 10)) {}
-
-  /// Rests at `x` [m] around `stamp`.
-  void rest(double x, const ros::Time& stamp) {
-    for (const double offset : {-0.2, -0.1, 0.0, 0.1, 0.2}) {
-      transforms_.sendTransform(toTransformStamped(Pose(Eigen::Translation3d(x, 0, 0)),
-                                                   stamp + ros::Duration(offset), base_, optical_));
-    }
-  }
-  void publish(sensor_msgs::ImagePtr image, const ros::Time& stamp) {
-    image->header.stamp = stamp;
-    image->header.frame_id = optical_;
-    images_.publish(image);
-  }
-  int listeners() const { return static_cast<int>(images_.getNumSubscribers()); }
-  const std::string& base() const { return base_; }
-  const std::string& optical() const { return optical_; }
-  ros::NodeHandle& node() { return node_; }
-
- private:
-  ros::NodeHandle node_;
-  std::string base_;
-  std::string optical_;
-  ros::Publisher images_;
-  tf2_ros::TransformBroadcaster transforms_;
-};
-
-ros::NodeHandle parametersFor(const Camera& camera, const std::string& name) {
-  ros::NodeHandle node("~" + name);
-  node.setParam("lens", lensPath());
-  node.setParam("fixed_frame", camera.base());
-  node.setParam("min_baseline", 0.1);
-  node.setParam("max_baseline", 0.3);
-  node.setParam("max_range", 20.0);
-  return node;
-}
-
-/// Publishes the pair with the given stamps, when everybody is there to hear it.
-void publishPair(Camera& camera, const ros::Time& first, const ros::Time& second) {
-  ASSERT_TRUE(eventually([&] { return camera.listeners() > 0; }));
-  camera.rest(0.0, first);
-  camera.publish(toImage(views().left, "bgr8"), first);
-  camera.rest(kBaseline, second);
-  camera.publish(toImage(views().right, "bgr8"), second);
-}
 
 cv::Mat floats(const sensor_msgs::Image& image) {
   return cv::Mat(static_cast<int>(image.height), static_cast<int>(image.width), CV_32FC1,
@@ -233,6 +169,59 @@ TEST(Stereo, GoesOnAfterEveryKindOfBadMessage) {
   EXPECT_TRUE(eventually([&] { return ranges.size() > 0; }));
 }
 
+TEST(Stereo, UnderOverloadTheNewestComesFirstAndTheRestIsCounted) {
+  constexpr int kImages = 60;
+  Camera camera("overload");
+  ros::NodeHandle parameters = parametersFor(camera, "overload");
+  parameters.setParam("settle_time", 0.0);
+  parameters.setParam("max_rate", 5.0);
+  const StereoPipeline stereo(camera.node(), parameters);
+  std::map<std::string, std::int64_t> values;
+  std::mutex mutex;
+  const ros::Subscriber diagnostics = camera.node().subscribe<diagnostic_msgs::DiagnosticArray>(
+      "/diagnostics", 100, [&](const diagnostic_msgs::DiagnosticArray::ConstPtr& message) {
+        const std::lock_guard<std::mutex> lock(mutex);
+        for (const auto& status : message->status) {
+          if (status.name.find("overload: stereo") == std::string::npos) continue;
+          values.clear();
+          for (const auto& value : status.values)
+            values[value.key] = std::atoll(value.value.c_str());
+        }
+      });
+  Collector<sensor_msgs::PointCloud2> clouds(camera.node(), "points2");
+  ASSERT_TRUE(eventually([&] { return camera.listeners() > 0; }));
+  const ros::Time begin = ros::Time::now();
+  ros::Time stamp;
+  for (int i = 0; i < kImages; ++i) {
+    stamp = begin + ros::Duration(0.02 * (i + 1));
+    camera.pass(i % 2 == 0 ? 0.0 : kBaseline, stamp);
+    camera.publish(toImage(i % 2 == 0 ? views().left : views().right, "bgr8"), stamp);
+    ros::WallDuration(0.02).sleep();
+  }
+  ASSERT_TRUE(eventually([&] { return clouds.size() > 0 && clouds.last()->header.stamp == stamp; }))
+      << "the last image has no cloud";
+  const auto got = clouds.messages();
+  EXPECT_LT(got.size(), kImages / 2U);
+  for (std::size_t i = 1; i < got.size(); ++i)
+    EXPECT_GT(got[i]->header.stamp, got[i - 1]->header.stamp);
+  // Every image is found in one of the counters.
+  const auto count = [&](const std::string& key) {
+    const auto found = values.find(key);
+    return found == values.end() ? 0 : found->second;
+  };
+  const std::string received = "images of " + camera.node().resolveName("image_raw");
+  EXPECT_TRUE(eventually([&] {
+    const std::lock_guard<std::mutex> lock(mutex);
+    return count("clouds") == static_cast<std::int64_t>(got.size()) &&
+           count(received) + count("dropped, missed") == kImages &&
+           count(received) == count("frames, settled") + count("frames, no pose") &&
+           count("frames, settled") == count("frames, paired") + count("frames, no baseline") &&
+           count("frames, paired") ==
+               count("clouds") + count("dropped, busy") + count("frames, superseded");
+  })) << testing::PrintToString(values);
+  EXPECT_GT(count("dropped, busy"), 0);
+}
+
 TEST(Stereo, ImagesOfAnyDepthAndColourGiveTheSameCloud) {
   cv::Mat left, right;
   cv::cvtColor(views().left, left, cv::COLOR_BGR2GRAY);
@@ -320,7 +309,9 @@ TEST(Stereo, IsTunedLiveWithinItsLimits) {
     c.min_range = 5.0;
     c.min_baseline = 0.5;
     c.epipolar_pixels = "one two";
+    c.max_range = std::nan("");
   });
+  EXPECT_EQ(crossed.max_range, 1.9);
   EXPECT_EQ(crossed.min_range, 0.0);
   EXPECT_EQ(crossed.min_baseline, 0.1);
   EXPECT_EQ(crossed.epipolar_pixels, "");

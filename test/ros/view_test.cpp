@@ -187,6 +187,9 @@ TEST_F(ViewNode, TurnsAndZoomsLive) {
   EXPECT_EQ(set("pan", 0.0), 0.0);
   EXPECT_EQ(set("tilt", 0.0), 0.0);
   EXPECT_EQ(set("roll", 0.0), 0.0);
+  EXPECT_EQ(set("pan", std::nan("")), 0.0) << "what is no number changes nothing";
+  EXPECT_EQ(set("pan", 100.0), ViewConfig::__getMax__().pan);
+  EXPECT_EQ(set("pan", 0.0), 0.0);
   EXPECT_EQ(set("hfov", 6.0), 3.0) << "the widest pinhole: who asked is told";
   EXPECT_EQ(set("pan", 99.0), M_PI) << "clamped";
   EXPECT_EQ(set("pan", 0.25), 0.25);

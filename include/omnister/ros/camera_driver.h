@@ -97,6 +97,7 @@ class CameraDriver {
   void stream();
   void openIfNeeded();
   void close(const std::string& problem);
+  void tell(const std::string& problem);
   bool wanted();
   void waitFor(double seconds);
   void publish(const device::Frame& frame);
@@ -167,11 +168,13 @@ class CameraDriver {
   bool streaming_ = false;
   bool wanted_ = false;
   std::chrono::steady_clock::time_point wanted_due_;
-  bool streamed_ = false;   // a frame came since it was started
-  std::uint64_t torn_ = 0;  // incomplete frames when whole ones still came
-  double slowest_s_ = 0.0;  // as long as the device itself may take for a frame
+  bool streamed_ = false;    // a frame came since it was started
+  double interval_s_ = 0.0;  // between the last two frames
+  std::uint64_t torn_ = 0;   // incomplete frames when whole ones still came
+  double slowest_s_ = 0.0;   // as long as the device itself may take for a frame
   std::chrono::steady_clock::time_point statistics_due_;
   std::optional<std::uint64_t> last_sequence_;
+  std::uint32_t published_ = 0;
   std::chrono::steady_clock::time_point last_frame_;
   ros::Time recorded_stamp_;
   std::string told_problem_;

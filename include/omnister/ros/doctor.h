@@ -17,6 +17,7 @@ struct DoctorFacts {
   bool master = true;  ///< answers
   std::string master_uri;
   bool sim_time = false;         ///< parameter /use_sim_time
+  bool registered = true;        ///< the master knows the doctor, who told it once
   bool clock_published = false;  ///< somebody publishes /clock
   int cores = 1;
   double load = 0.0;                       ///< of the last minute

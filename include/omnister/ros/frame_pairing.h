@@ -82,10 +82,13 @@ class FramePairing {
 
   /// True while frames wait for their poses: poll() again soon.
   bool waiting() const { return !waiting_.empty(); }
+  std::size_t waitingFrames() const { return waiting_.size(); }
   /// Frames held, waiting ones included: bounded by max_waiting + history + 1.
   std::size_t held() const { return waiting_.size() + history_.size() + (newest_ ? 1 : 0); }
   /// Why the last settled or refused frame made no set; empty after one that did.
   const std::string& reason() const { return reason_; }
+  /// The last frame that was looked up was dropped because the camera moves: that passes by itself.
+  bool moving() const { return moving_; }
   /// Since the last set: the distance between two places that came last and was not within the
   /// baseline limits [m].
   const std::optional<double>& missedBaseline() const { return missed_baseline_; }
@@ -93,7 +96,7 @@ class FramePairing {
   const std::map<std::string, std::size_t>& counts() const { return counts_; }
 
  private:
-  enum class Verdict { kWait, kDrop, kSettled };
+  enum class Verdict { kWait, kDrop, kMoving, kSettled };
   Verdict judge(PairingFrame& frame, const PoseLookup& lookup);
   void keep(PairingFrame frame);
   std::optional<FrameSet> makeSet();
@@ -111,6 +114,7 @@ class FramePairing {
   std::optional<PairingFrame> newest_;
   std::optional<std::int64_t> last_stamp_ns_;
   std::string reason_ = "no image yet";
+  bool moving_ = false;
   std::optional<double> missed_baseline_;
   std::map<std::string, std::size_t> counts_;
 };

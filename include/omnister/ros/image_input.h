@@ -4,6 +4,7 @@
 
 #include <sensor_msgs/Image.h>
 
+#include <cstdint>
 #include <opencv2/core/mat.hpp>
 #include <string>
 
@@ -26,5 +27,18 @@ cv::Mat toGray(const sensor_msgs::Image& image, int bits);
 
 /// CV_8UC3, BGR; else as toGray().
 cv::Mat toBgr(const sensor_msgs::Image& image, int bits);
+
+/// Tells how many messages of a publisher did not reach us, by the numbers in their headers: queues
+/// on the way drop without a word.
+class MissingMessages {
+ public:
+  /// @return how many are missing between the message before and this one; 0 for the first, for
+  /// numbers that begin anew and for publishers that give none
+  std::uint32_t before(const std_msgs::Header& header);
+  void reset() { last_ = 0; }
+
+ private:
+  std::uint32_t last_ = 0;
+};
 
 }  // namespace omnister

@@ -38,6 +38,8 @@ struct ScanParameters {
   double still_px = 0.5;            ///< the picture moved less since the image before; 0: any
   double stop_timeout_s = 10.0;     ///< longest wait for settled images at a stop
   double max_wait_s = 1.0;          ///< for a reading of the stage after an image
+  /// Recordings go into this folder and nowhere else; empty: `scans` in that of the calibrations.
+  std::filesystem::path folder;
 };
 
 /// @throws InputError naming key, value and range

@@ -5,16 +5,32 @@
 ///
 /// With `~boards`, the service `~show_board` (std_srvs/SetBool) carries a calibration board before
 /// the camera, as a person would: true shows it at its next pose, false takes it away.
+///
+/// What goes wrong with hardware goes wrong here by a word on the topic `~fault` (std_msgs/String):
+/// - `camera off`, `camera on`: its power
+/// - `camera freeze`, `camera thaw`: it answers and gives no frames
+/// - `camera loss 0.3`: a share of the packets gets lost
+/// - `camera size 200 150`: another region while it streams [px]
+/// - `stage stall`, `stage reset`: the motor; the power goes and comes
+/// - `stage unplug`, `stage plug`: the cable
+/// - `stage freeze`, `stage thaw`: it answers nothing
+/// - `stage garble 0.1`: a share of the lines on the cable is not what was said
+/// - `stage slip`, `stage grip`: the carriage does not follow, whatever the controller says
 #pragma once
 
 #include <ros/node_handle.h>
+#include <std_msgs/String.h>
 #include <std_srvs/SetBool.h>
 
 #include <Eigen/Core>
 #include <atomic>
+#include <cmath>
 #include <filesystem>
+#include <functional>
 #include <memory>
+#include <mutex>
 #include <string>
+#include <vector>
 
 #include "omnister/common/pose.h"
 #include "omnister/sim/gige_server.h"
@@ -50,18 +66,32 @@ class SimRig {
   /// @throws Error for a broken scene or lens file, a port or address that cannot be had
   SimRig(const ros::NodeHandle& private_node, const SimRigParameters& parameters);
 
-  std::string cameraDevice() const { return server_->device(); }
+  std::string cameraDevice() const { return "aravis:" + parameters_.camera.serial; }
   std::string stageDevice() const;
   sim::SimulatedStage& stage() { return *stage_; }
 
  private:
+  /// What the picture depends on beside the stage; shared with the thread that draws.
+  struct View {
+    std::atomic<bool> frozen{false};
+    std::atomic<double> slipped_at{std::nan("")};  ///< where the carriage hangs [m]
+  };
+
+  void onFault(const std_msgs::String& message);
+  void cameraFault(const std::vector<std::string>& words);
+  void stageFault(const std::vector<std::string>& words);
+
   const SimRigParameters parameters_;
   /// Pose of the board that is seen; negative: it is not there.
   std::shared_ptr<std::atomic<int>> board_;
   ros::ServiceServer show_board_;
   std::shared_ptr<sim::SimulatedStage> stage_;
   std::unique_ptr<sim::SerialStageDevice> controller_;
+  const std::shared_ptr<View> view_ = std::make_shared<View>();
+  std::function<std::unique_ptr<sim::GigeServer>()> power_up_;  ///< of the camera
+  std::mutex mutex_;                                            ///< server_
   std::unique_ptr<sim::GigeServer> server_;
+  ros::Subscriber fault_subscriber_;
 };
 
 }  // namespace omnister

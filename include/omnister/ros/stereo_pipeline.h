@@ -28,6 +28,7 @@
 #include "omnister/ros/callback_threads.h"
 #include "omnister/ros/drift_diagnostic.h"
 #include "omnister/ros/frame_pairing.h"
+#include "omnister/ros/image_input.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/stereo_worker.h"
@@ -75,6 +76,8 @@ class StereoPipeline {
     std::string lens_text;  ///< of the message it came in
     ros::Time lens_stamp;
     bool lens_from_file = false;
+    std::uint64_t received = 0;  ///< images
+    MissingMessages missing;
   };
   using SyncPolicy =
       message_filters::sync_policies::ApproximateTime<sensor_msgs::Image, sensor_msgs::Image>;
@@ -88,6 +91,7 @@ class StereoPipeline {
   void pick(const Eigen::Vector2d& pixel);  ///< mutex_ is held
   void publishLens(const std::string& frame_id);
   void onLens(const LensModelMessage::ConstPtr& message, std::size_t eye);
+  void count(const sensor_msgs::Image& image, std::size_t eye);
   void onImage(const sensor_msgs::ImageConstPtr& image);
   void onImages(const sensor_msgs::ImageConstPtr& left, const sensor_msgs::ImageConstPtr& right);
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
@@ -99,9 +103,14 @@ class StereoPipeline {
   void process(const StereoSet& job);
   void publishOverlay(const StereoSet& job, const PreparedSet& prepared,
                       const StereoParameters& live, const MatchResult& result);
-  PoseAnswer cameraPose(const std::string& frame_id, std::int64_t stamp_ns) const;
+  PoseAnswer cameraPose(const std::string& frame_id, std::int64_t stamp_ns);
+  /// Empties the tf buffer where it is filled from the future. @return true if it was
+  bool forgetFuture(const std::string& frame_id);
   std::optional<Pose> rigPose(const sensor_msgs::Image& left, const sensor_msgs::Image& right,
                               std::string* reason) const;
+  /// Why there are no clouds though somebody listens; empty while they come as they should. mutex_
+  /// is held.
+  std::string whySilent() const;
   cv::Size expectedSize(std::size_t eye) const;
 
   /// Counts a dropped frame or set and remembers why; `fault`: also warns, throttled by name.
@@ -141,12 +150,15 @@ class StereoPipeline {
   std::string lens_frame_;            ///< the frame that the lens marker was published in
   FramePairing pairing_;
   std::optional<StereoSet> pending_;  ///< newest set that waits to be matched
+  bool in_work_ = false;              ///< a set is being matched
   std::map<std::string, std::size_t> drops_;
   std::map<std::string, ros::SteadyTime> warned_;
   std::string reason_ = "no image yet";
   std::size_t clouds_ = 0;
-  ros::SteadyTime last_start_;  ///< of a match
-  ros::SteadyTime last_cloud_;  ///< or since when somebody listens
+  ros::SteadyTime last_start_;   ///< of a match
+  ros::SteadyTime last_cloud_;   ///< or since when somebody listens
+  ros::SteadyTime last_image_;   ///< of the reference camera; zero: none yet
+  double image_interval_ = 0.0;  ///< between the last two [s]
   MatchStatistics last_statistics_;
 
   StereoWorker worker_;                ///< used by thread_ only

@@ -3,6 +3,7 @@
 /// see from the same place, for nodes that know pinhole cameras only.
 #pragma once
 
+#include <diagnostic_updater/diagnostic_updater.h>
 #include <dynamic_reconfigure/server.h>
 #include <image_transport/image_transport.h>
 #include <omnister/ViewConfig.h>
@@ -16,6 +17,7 @@
 
 #include "omnister/lens/lens_file.h"
 #include "omnister/ros/callback_threads.h"
+#include "omnister/ros/image_input.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/static_frames.h"
@@ -55,6 +57,15 @@ class ViewServer {
     std::unique_ptr<View> image;       // made when first wanted
     std::unique_ptr<DepthView> depth;  // likewise
   };
+  /// What became of the messages of one input.
+  struct Tally {
+    std::uint64_t received = 0;
+    std::uint64_t published = 0;
+    std::uint64_t missed = 0;  ///< they came faster than they could be taken in
+    std::uint64_t failed = 0;
+    MissingMessages numbers;
+    void take(const std_msgs::Header& header);
+  };
 
   void configure(ViewConfig& config);
   void onConnection();
@@ -65,7 +76,10 @@ class ViewServer {
   /// mutex_ is held. Tells tf where the view is. @return its frame
   const std::string& frameFor(const std::string& camera_frame);
   sensor_msgs::CameraInfo info(const ViewGeometry& geometry, const std_msgs::Header& header) const;
-  void say(const std::exception& error) const;
+  void say(const std::exception& error);
+  /// Publishes nothing for this message. @param tally of its input
+  void drop(Tally& tally, const std::exception& error);
+  void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
   const ViewParameters parameters_;
   CallbackThreads callbacks_;  // before all that uses it
@@ -84,6 +98,9 @@ class ViewServer {
   std::string lens_text_;
   ros::Time lens_stamp_;
   std::optional<Maps> maps_;
+  Tally images_;
+  Tally ranges_;
+  std::string problem_;  ///< with the last message; empty when there is none
   std::string camera_frame_;
   std::string view_frame_;
   Eigen::Matrix3d told_rotation_ = Eigen::Matrix3d::Zero();  ///< of the last static tf
@@ -91,6 +108,8 @@ class ViewServer {
 
   boost::recursive_mutex config_mutex_;
   std::unique_ptr<dynamic_reconfigure::Server<ViewConfig>> config_server_;
+  diagnostic_updater::Updater diagnostics_;
+  ros::SteadyTimer diagnostics_timer_;
 };
 
 }  // namespace omnister

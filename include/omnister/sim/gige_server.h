@@ -54,6 +54,9 @@ class GigeServer {
   std::string device() const;
   /// Share of packets lost from now on, 0 to 1.
   void setPacketLoss(double share);
+  /// Another image size from now on, at the corner of the sensor, as if another program had written
+  /// the registers while the camera streams. Sides within the sensor's [px].
+  void setRegion(cv::Size size);
   /// A pulse on Line0.
   void pulseLine0();
   /// As an automatic exposure would: nobody is told [us].
