@@ -19,6 +19,7 @@ from pathlib import Path
 
 HEADLESS_SECONDS = 170.0  # everything, start to end
 BOARD_PATIENCE = 6.0  # before the board is held elsewhere though no view was taken [s]
+REST = 8.0  # of the stage, until a scan that a hand interrupted goes on [s]
 POSITIONS = [0.0, 0.1, 0.2, 0.3, 0.4]  # of the scan [m]
 ARTEFACTS = ['lens.yaml', 'cloud.ply', 'range.tiff', 'run.bag', 'cloud.png']
 RECORDED = ['/camera/image_raw', '/camera/camera_info', '/camera/lens_model', '/camera/points2',
@@ -217,6 +218,13 @@ class Rig:
                         2.0 * 57.29578 * result.max_theta))
         return result.lens_file
 
+    def wait_for_rest(self, seconds):
+        since = time.monotonic()
+        while time.monotonic() - since < seconds and not self.rospy.is_shutdown():
+            if self.stage_state and self.stage_state.moving:
+                since = time.monotonic()
+            time.sleep(0.1)
+
     def stop_at(self, position):
         """Until the stage and the picture stand still there."""
         self.act('/camera/scan', 'Scan', self.msg.ScanGoal(positions=[position]), 30.0)
@@ -340,13 +348,21 @@ def conduct(options, clock, processes, work):
     rig.scan(POSITIONS)
     if not options.headless:
         clock.say('the rig goes on scanning: close rviz or press Ctrl-C to end')
+        failures = 0
         while launch.poll() is None:
             try:
                 rig.scan(POSITIONS[::-1])
                 rig.scan(POSITIONS)
-            except Failure:
-                if launch.poll() is None:
+                failures = 0
+            except Failure as failure:
+                if launch.poll() is not None:
+                    break
+                # Who drags the handle in rviz takes the stage away from the scan.
+                failures += 1
+                if failures == 3:
                     raise
+                clock.say('%s; the scan goes on when the stage has rested for %.0f s' % (failure, REST))
+                rig.wait_for_rest(REST)
         return
     shutil.copyfile(lens_file, work / 'lens.yaml')
     clock.say('saving: ' + rig.call('/camera/snapshot/save', rig.Trigger))
