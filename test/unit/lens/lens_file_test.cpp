@@ -385,7 +385,7 @@ TEST(LensFile, SurvivesBrokenBytes) {
           text.insert(place, 1, "[]{}:,-#&*!|>'\"%@`\n\t 9e."[random() % 24]);
           break;
         default:
-          text = text.substr(0, std::max<std::size_t>(place, 1));
+          text.resize(std::min(text.size(), std::max<std::size_t>(place, 1)));
       }
     }
     try {

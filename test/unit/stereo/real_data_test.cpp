@@ -124,7 +124,7 @@ TEST_P(CarFisheye, FivePositionsTightenThePavement) {
   EXPECT_GT(five.all.points, 0.99 * two.all.points);
 }
 
-INSTANTIATE_TEST_SUITE_P(, CarFisheye,
+INSTANTIATE_TEST_SUITE_P(Recorded, CarFisheye,
                          ::testing::Values(CarCase{"left", 0.932, 0.03},
                                            CarCase{"right", 0.887, 0.015}),
                          [](const auto& info) { return info.param.side; });

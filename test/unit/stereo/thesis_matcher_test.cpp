@@ -151,7 +151,7 @@ TEST_P(EveryModel, AWallFromASidewaysMove) {
   EXPECT_LT(match.accuracy.beyond_one_px, 0.03);
 }
 
-INSTANTIATE_TEST_SUITE_P(, EveryModel, ::testing::ValuesIn(lensModelNames()),
+INSTANTIATE_TEST_SUITE_P(Shipped, EveryModel, ::testing::ValuesIn(lensModelNames()),
                          [](const auto& info) { return info.param; });
 
 struct PoseCase {
@@ -178,7 +178,7 @@ TEST_P(EveryPose, ARoom) {
 }
 
 INSTANTIATE_TEST_SUITE_P(
-    , EveryPose,
+    Known, EveryPose,
     ::testing::Values(PoseCase{"Sideways", pose(0.4, 0, 0), 900},
                       PoseCase{"Left", pose(-0.4, 0, 0), 900},
                       PoseCase{"Up", pose(0, -0.4, 0), 900},
