@@ -4,13 +4,14 @@ set -euo pipefail
 
 usage() {
   cat <<'TXT'
-./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling | camera | calibration [OPTION…]]
+./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling | node | camera | calibration [OPTION…]]
 
   parts      Google Benchmark: lenses, renderer, views, the sweep
   compare    the sweep beside OpenCV's matchers on the same rendered pair, at 1280x960 and 3060x2036,
              one thread and all: times as ratios, memory, density, errors
   accuracy   errors of the sweep by field angle on further scenes; phase bias; more than two positions
   scaling    cost by pixels, hypotheses, positions and threads, with a plot
+  node       clouds a second of the stereo node at 1280x960, image messages to published clouds
   camera     processor time of the camera driver beside a bare Aravis loop, on Debian's software camera
   calibration  lenses, calibration and detection beside the limits that they are held to; names choose
              among them (recorded corners lenses simulation stage time detection scan)
@@ -58,6 +59,20 @@ compare() {
 # 77: there is no camera to measure on.
 camera() { /usr/bin/python3 "$here/camera_cost.py" "$@" || [ $? -eq 77 ]; }
 calibration() { omnister_bench_calibration ${out:+--out "$out"} "$@"; }
+node() {
+  # A master of its own, on a port that is free.
+  local port
+  port=$(/usr/bin/python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
+  export ROS_MASTER_URI=http://localhost:$port ROS_HOSTNAME=localhost
+  rosmaster --core -p "$port" >/dev/null 2>&1 &
+  local master=$!
+  trap 'kill '"$master" EXIT
+  for _ in $(seq 300); do
+    rosparam list >/dev/null 2>&1 && break
+    sleep 0.1
+  done
+  omnister_bench_node "$@"
+}
 
 case "$part" in
   all)
@@ -65,6 +80,7 @@ case "$part" in
     compare
     stereo --suite accuracy
     stereo --suite scaling --runs "$([ -n "$quick" ] && echo 3 || echo 5)"
+    node --clouds "$([ -n "$quick" ] && echo 30 || echo 100)"
     camera --rounds "$([ -n "$quick" ] && echo 1 || echo 5)"
     ;;
   parts) parts "$@" ;;
@@ -73,6 +89,7 @@ case "$part" in
   scaling) stereo --suite scaling "$@" ;;
   camera) camera "$@" ;;
   calibration) calibration "$@" ;;
+  node) node "$@" ;;
   *)
     usage >&2
     exit 2

@@ -26,6 +26,7 @@
 #include "omnister/sim/scene.h"
 #include "plot.h"
 #include "rectified_stereo.h"
+#include "requirements.h"
 #include "stereo_pair.h"
 
 namespace omnister::bench {
@@ -173,10 +174,15 @@ Contestant makeContestant(const std::string& method, const StereoCase& pair, int
   contestant.method = method;
   const PeakMemory memory;
   const Instant start = Instant::now();
-  if (method == "sweep" || method == "thesis") {
+  const bool cost = method == "zncc" || method == "eq3.1";
+  const bool window = method == "ray" || method == "fronto" || method == "best";
+  if (method == "sweep" || method == "thesis" || cost || window) {
     MatcherOptions options;
     options.threads = threads;
-    std::shared_ptr<Matcher> matcher = makeMatcher(method, pair.geometry, options);
+    if (cost) options.cost = parseMatchCost(method);
+    if (window) options.window = parseMatchWindow(method);
+    std::shared_ptr<Matcher> matcher =
+        makeMatcher(method == "thesis" ? method : "sweep", pair.geometry, options);
     contestant.frame = [matcher, &pair](RectifiedStereo::Times*,
                                         std::map<std::string, double>* stages) {
       MatchResult result = matcher->match(pair.reference, pair.displaced);
@@ -334,6 +340,7 @@ cv::Mat sweepRange(const StereoCase& pair) {
 }
 
 void accuracy(const Settings& settings, Json& json) {
+  Requirements required;
   const auto report = [&](const std::string& what, const StereoCase& pair, const cv::Mat& range) {
     const Score s = score(pair, range);
     std::printf("%-34s density %.4f  median %.3f %%  >1px %.3f %%  >2%% %.3f %%  occluded %.3f\n",
@@ -352,6 +359,14 @@ void accuracy(const Settings& settings, Json& json) {
     row.score = s;
     json["rows"].push_back(toJson(row));
     std::fflush(stdout);
+    return s;
+  };
+  // Of the bands of off-axis angle between two limits [degrees] the worst.
+  const auto worstMedian = [](const Score& s, double from, double to) {
+    double worst = 0.0;
+    for (const auto& band : s.bands)
+      if (band.from_deg >= from && band.to_deg <= to) worst = std::max(worst, band.median_percent);
+    return worst;
   };
   cv::Size size = parseSize(settings.sizes.front());
   const LensPtr lens = lensFor(settings, size);
@@ -360,7 +375,19 @@ void accuracy(const Settings& settings, Json& json) {
   std::printf("\nErrors of the sweep, %s\n", sizeText(size).c_str());
   for (const char* name : {"room", "corridor", "weak_texture"}) {
     const StereoCase pair = makeCase(name, *loadScene(settings, name), lens, size, options);
-    report(name, pair, sweepRange(pair));
+    const Score s = report(name, pair, sweepRange(pair));
+    const std::string which = name;
+    if (which == "weak_texture") required.check("weak texture: median [%]", s.median_percent, 0.42);
+    if (which != "room") continue;
+    required.check("room: density", s.density, 0.98, true);
+    required.check("room: median [%]", s.median_percent, 0.20);
+    required.check("room: more than 1 px [%]", 100 * s.over_1px, 0.45);
+    required.check("room: more than 2 % [%]", 100 * s.over_2percent, 1.5);
+    required.check("room: occluded pixels that get a depth", s.occluded_filled, 0.15);
+    required.check("room, 80 to 90 degrees: median [%]", worstMedian(s, 80, 90), 0.30);
+    for (const auto& band : s.bands)
+      if (band.from_deg == 80)
+        required.check("room, 80 to 90 degrees: density", band.density, 0.98, true);
   }
   for (const char* name : {"room", "weak_texture"}) {
     CaseOptions noisy = options;
@@ -374,7 +401,11 @@ void accuracy(const Settings& settings, Json& json) {
     wall.baseline = 0.25;  // the wall stands at 2 m
     const StereoCase pair = makeCase("plane at 8 baselines", *plane, lens, size, wall);
     const cv::Mat range = sweepRange(pair);
-    report("plane at 8 baselines", pair, range);
+    const Score s = report("plane at 8 baselines", pair, range);
+    required.check("plane at 8 baselines, within 40 degrees: worst median [%]",
+                   worstMedian(s, 0, 40), 0.12);
+    required.check("plane at 8 baselines, 60 to 70 degrees: median [%]", worstMedian(s, 60, 70),
+                   0.40);
     constexpr int kBins = 10;
     const std::vector<double> bias = biasByPhase(pair, range, kBins);
     double worst = 0.0;
@@ -384,6 +415,7 @@ void accuracy(const Settings& settings, Json& json) {
       worst = std::max(worst, std::abs(b));
     }
     std::printf("   worst %.4f\n", worst);
+    required.check("plane at 8 baselines: worst bias by phase [px]", worst, 0.03);
     json["bias_by_phase_px"] = bias;
   }
   // More positions: the same step (so more travel), and the same travel.
@@ -394,13 +426,17 @@ void accuracy(const Settings& settings, Json& json) {
     CaseOptions many = options;
     many.baseline = baseline / 4.0;
     const StereoCase step = makeCase("room, one quarter step", *room, lens, size, many);
-    report("2 positions, a quarter step", step, sweepRange(step));
+    const Score of_step = report("2 positions, a quarter step", step, sweepRange(step));
     many.positions = 4;
     const StereoCase five = makeCase("room, four quarter steps", *room, lens, size, many);
-    report("5 positions, the same step", five, sweepRange(five));
+    const cv::Mat of_five = sweepRange(five);
+    const Score steps = report("5 positions, the same step", five, of_five);
+    required.check("five positions over two of the same step: median",
+                   steps.median_percent / of_step.median_percent, 0.35);
     // The pair of the whole travel, judged where it cannot see.
     const cv::Mat of_two = sweepRange(two);
-    const cv::Mat of_five = sweepRange(five);
+    required.check("five positions over two of the same travel: median",
+                   score(two, of_five).median_percent / score(two, of_two).median_percent, 1.0);
     std::size_t hidden = 0, two_right = 0, five_right = 0;
     for (int y = 0; y < size.height; ++y) {
       for (int x = 0; x < size.width; ++x) {
@@ -418,10 +454,15 @@ void accuracy(const Settings& settings, Json& json) {
         "where only the nearer positions see (%zu px): right to 2 %%: two positions %.3f, five "
         "%.3f\n",
         hidden, static_cast<double>(two_right) / hidden, static_cast<double>(five_right) / hidden);
+    required.check("where two are hidden from each other: right of five over right of two",
+                   static_cast<double>(five_right) / std::max<std::size_t>(two_right, 1), 1.0,
+                   true);
     json["hidden_from_last"] = {{"pixels", hidden},
                                 {"right_of_two", static_cast<double>(two_right) / hidden},
                                 {"right_of_five", static_cast<double>(five_right) / hidden}};
   }
+  std::printf("%d figure(s) fall short\n", required.fallShort());
+  json["required"] = required.json();
 }
 
 void scaling(const Settings& settings, Json& json) {
@@ -528,8 +569,11 @@ int run(int argc, char** argv) {
   app.add_option("--lens", settings.lens, "Lens file; default: 180 degrees, equidistant, any size");
   app.add_option("--size", settings.sizes, "Image sizes, WxH")->capture_default_str();
   app.add_option("--threads", settings.threads, "Numbers of threads; default: one and all");
-  app.add_option("--methods", settings.methods, "sweep, thesis, bm, sgbm, 3way")
-      ->check(CLI::IsMember({"sweep", "thesis", "bm", "sgbm", "3way"}))
+  app.add_option("--methods", settings.methods,
+                 "sweep, its costs zncc and eq3.1, its windows ray, fronto and best; thesis, bm, "
+                 "sgbm, 3way")
+      ->check(CLI::IsMember(
+          {"sweep", "zncc", "eq3.1", "ray", "fronto", "best", "thesis", "bm", "sgbm", "3way"}))
       ->capture_default_str();
   app.add_option("--runs", settings.runs, "Timed runs, by turns")
       ->check(CLI::Range(1, 1000))

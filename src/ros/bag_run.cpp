@@ -28,6 +28,13 @@ constexpr double kTfMargin = 60.0;  // [s] that stamps may lie outside the bag's
 
 std::string namespaceOf(const std::string& topic) { return topic.substr(0, topic.rfind('/') + 1); }
 
+WorkerSettings settingsOf(const BagRunOptions& options) {
+  WorkerSettings settings;
+  settings.matcher = options.matcher;
+  settings.matching = options.matching;
+  return settings;
+}
+
 class BagRun {
  public:
   BagRun(const std::filesystem::path& path, const BagRunOptions& options,
@@ -39,7 +46,7 @@ class BagRun {
         take_(take),
         progress_(progress),
         pairing_(options.pairing),
-        worker_(options.matcher, options.matching) {
+        worker_(settingsOf(options)) {
     open(path);
   }
 
@@ -255,11 +262,12 @@ class BagRun {
     }
     const auto start = std::chrono::steady_clock::now();
     try {
-      const PreparedSet prepared = StereoWorker::prepare(set, *lenses_.front(), *lenses_.back(),
-                                                         topics_.front(), topics_.back());
-      result.match =
-          worker_.matcherFor(prepared.geometry).match(prepared.reference, prepared.displaced);
-      result.cloud = worker_.points(set, prepared, result.match, *lenses_.front(), true);
+      const PreparedSet prepared =
+          worker_.prepare(set, *lenses_.front(), *lenses_.back(), topics_.front(), topics_.back());
+      const MatchedSet matched = *worker_.match(set, prepared);  // no stream
+      result.match = matched.result;
+      result.cloud = makeCloud(result.match, worker_.rays(matched), worker_.picture(matched, true),
+                               options_.matching.threads);
     } catch (const Error& error) {
       return drop(error.what());
     }

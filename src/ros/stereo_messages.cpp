@@ -9,6 +9,7 @@
 #include <string>
 
 #include "omnister/common/error.h"
+#include "omnister/common/parallel.h"
 
 namespace omnister {
 namespace {
@@ -40,13 +41,12 @@ sensor_msgs::ImagePtr floatImage(cv::Size size, const std_msgs::Header& header) 
   return message;
 }
 
-}  // namespace
-
-sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Header& header) {
-  auto message = boost::make_shared<sensor_msgs::PointCloud2>();
+/// Everything but the points, of which there is room.
+void layOut(cv::Size size, const std_msgs::Header& header, sensor_msgs::PointCloud2* message) {
   message->header = header;
-  message->width = static_cast<std::uint32_t>(cloud.xyz.cols);
-  message->height = static_cast<std::uint32_t>(cloud.xyz.rows);
+  message->width = static_cast<std::uint32_t>(size.width);
+  message->height = static_cast<std::uint32_t>(size.height);
+  message->fields.clear();
   std::uint32_t offset = 0;
   for (const char* name : {"x", "y", "z", "rgb", "sigma", "score"}) {
     sensor_msgs::PointField field;
@@ -62,6 +62,18 @@ sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Hea
   message->point_step = sizeof(Point);
   message->row_step = message->point_step * message->width;
   message->data.resize(static_cast<std::size_t>(message->row_step) * message->height);
+}
+
+std::uint32_t packed(const cv::Vec3b& bgr) {
+  return static_cast<std::uint32_t>(bgr[2]) << 16 | static_cast<std::uint32_t>(bgr[1]) << 8 |
+         bgr[0];
+}
+
+}  // namespace
+
+sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Header& header) {
+  auto message = boost::make_shared<sensor_msgs::PointCloud2>();
+  layOut(cloud.xyz.size(), header, message.get());
   std::uint8_t* out = message->data.data();
   for (int v = 0; v < cloud.xyz.rows; ++v) {
     const auto* xyz = cloud.xyz.ptr<cv::Vec3f>(v);
@@ -69,17 +81,46 @@ sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Hea
     const auto* sigma = cloud.sigma.ptr<float>(v);
     const auto* score = cloud.score.ptr<float>(v);
     for (int u = 0; u < cloud.xyz.cols; ++u, out += sizeof(Point)) {
-      const Point point{xyz[u][0],
-                        xyz[u][1],
-                        xyz[u][2],
-                        static_cast<std::uint32_t>(bgr[u][2]) << 16 |
-                            static_cast<std::uint32_t>(bgr[u][1]) << 8 | bgr[u][0],
-                        sigma[u],
-                        score[u]};
+      const Point point{xyz[u][0], xyz[u][1], xyz[u][2], packed(bgr[u]), sigma[u], score[u]};
       std::memcpy(out, &point, sizeof point);
     }
   }
   return message;
+}
+
+void fillPointCloud(const MatchResult& match, const cv::Mat& rays, const cv::Mat& image,
+                    const std_msgs::Header& header, int threads,
+                    sensor_msgs::PointCloud2* message) {
+  const cv::Size size = match.range.size();
+  if (rays.size() != size || rays.type() != CV_32FC3 || image.size() != size ||
+      (image.type() != CV_8UC1 && image.type() != CV_8UC3))
+    throw Error("range, rays and image of a cloud differ in size");
+  layOut(size, header, message);
+  constexpr std::size_t kRows = 16;
+  parallelFor(
+      0, static_cast<std::size_t>(size.height), threads,
+      [&](std::size_t row) {
+        const int v = static_cast<int>(row);
+        const auto* range = match.range.ptr<float>(v);
+        const auto* sigma = match.sigma.ptr<float>(v);
+        const auto* score = match.score.ptr<float>(v);
+        const auto* ray = rays.ptr<cv::Vec3f>(v);
+        std::uint8_t* out = message->data.data() + row * message->row_step;
+        const auto fill = [&](const auto* grey_or_color, const auto& rgb) {
+          for (int u = 0; u < size.width; ++u, out += sizeof(Point)) {
+            // Without a range all three are NaN.
+            const float r = range[u];
+            const Point point{r * ray[u][0],         r * ray[u][1], r * ray[u][2],
+                              rgb(grey_or_color[u]), sigma[u],      score[u]};
+            std::memcpy(out, &point, sizeof point);
+          }
+        };
+        if (image.type() == CV_8UC1)
+          fill(image.ptr<std::uint8_t>(v), [](std::uint8_t grey) { return grey * 0x010101u; });
+        else
+          fill(image.ptr<cv::Vec3b>(v), packed);
+      },
+      kRows);
 }
 
 Cloud fromPointCloud(const sensor_msgs::PointCloud2& message) {
@@ -122,14 +163,18 @@ Cloud fromPointCloud(const sensor_msgs::PointCloud2& message) {
   return cloud;
 }
 
-sensor_msgs::ImagePtr toDepth(const Cloud& cloud, const std_msgs::Header& header) {
-  const sensor_msgs::ImagePtr message = floatImage(cloud.xyz.size(), header);
-  cv::Mat depth(cloud.xyz.size(), CV_32FC1, message->data.data(), message->step);
+sensor_msgs::ImagePtr toDepth(const cv::Mat& range, const cv::Mat& rays,
+                              const std_msgs::Header& header) {
+  const sensor_msgs::ImagePtr message = floatImage(range.size(), header);
+  cv::Mat depth(range.size(), CV_32FC1, message->data.data(), message->step);
   for (int v = 0; v < depth.rows; ++v) {
-    const auto* xyz = cloud.xyz.ptr<cv::Vec3f>(v);
+    const auto* along = range.ptr<float>(v);
+    const auto* ray = rays.ptr<cv::Vec3f>(v);
     auto* row = depth.ptr<float>(v);
-    for (int u = 0; u < depth.cols; ++u)
-      row[u] = xyz[u][2] > 0.0F ? xyz[u][2] : std::numeric_limits<float>::quiet_NaN();
+    for (int u = 0; u < depth.cols; ++u) {
+      const float z = along[u] * ray[u][2];
+      row[u] = z > 0.0F ? z : std::numeric_limits<float>::quiet_NaN();
+    }
   }
   return message;
 }

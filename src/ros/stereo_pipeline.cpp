@@ -7,21 +7,23 @@
 #include <visualization_msgs/MarkerArray.h>
 
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cmath>
 #include <utility>
 
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
-#include "omnister/common/image_file.h"
 #include "omnister/common/numbers.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/lens_markers.h"
 #include "omnister/ros/live_parameters.h"
 #include "omnister/ros/stereo_messages.h"
-#include "omnister/stereo/cloud.h"
+#include "omnister/stereo/input_region.h"
+#include "omnister/stereo/matching_limits.h"
 #include "omnister/view/epipolar_overlay.h"
+#include "stereo_parameters.h"
 
 namespace omnister {
 namespace {
@@ -33,51 +35,8 @@ constexpr std::size_t kMostClicked = 8;  // pixels of the overlay; the oldest go
 constexpr double kWarningPeriod = 5.0;   // [s]
 constexpr double kQuiet = 0.7;           // [s] without a cloud that call for no reason
 constexpr double kFuture = 2.0;          // [s] that tf may run ahead of the clock
+constexpr std::size_t kCloudsKept = 3;   // messages that are filled again when nobody holds them
 constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said why
-
-cv::Mat loadMask(const std::string& path) {
-  if (path.empty()) return {};
-  return readImage(path, ImageColor::kGray);
-}
-
-/// Frames that may be needed to find `positions` places.
-std::size_t historyFor(int positions) { return static_cast<std::size_t>(positions) + 7; }
-
-void applyPreset(StereoConfig& config) {
-  if (config.preset == "custom") return;
-  config.matcher = "sweep";
-  config.positions = config.preset == "accurate" ? 4 : 1;
-  config.hypotheses = 0;
-}
-
-StereoConfig toConfig(const StereoParameters& parameters) {
-  StereoConfig config = StereoConfig::__getDefault__();
-  config.preset = parameters.preset;
-  config.min_baseline = parameters.pairing.min_baseline;
-  config.max_baseline = parameters.pairing.max_baseline;
-  config.positions = parameters.pairing.positions;
-  config.min_range = parameters.matching.min_range;
-  config.max_range = parameters.matching.max_range;
-  config.hypotheses = parameters.matching.hypotheses;
-  config.matcher = parameters.matcher;
-  config.max_rate = parameters.min_period > 0.0 ? 1.0 / parameters.min_period : 0.0;
-  config.epipolar_pixels = parameters.epipolar_pixels;
-  return config;
-}
-
-void take(const StereoConfig& config, StereoParameters& parameters) {
-  parameters.preset = config.preset;
-  parameters.pairing.min_baseline = config.min_baseline;
-  parameters.pairing.max_baseline = config.max_baseline;
-  parameters.pairing.positions = config.positions;
-  parameters.pairing.history = historyFor(config.positions);
-  parameters.matching.min_range = config.min_range;
-  parameters.matching.max_range = config.max_range;
-  parameters.matching.hypotheses = config.hypotheses;
-  parameters.matcher = config.matcher;
-  parameters.min_period = config.max_rate > 0.0 ? 1.0 / config.max_rate : 0.0;
-  parameters.epipolar_pixels = config.epipolar_pixels;
-}
 
 /// The test that rejected most pixels.
 std::string mostRejecting(const MatchStatistics& statistics) {
@@ -106,52 +65,6 @@ std::string tenths(double value) { return formatNumber(std::round(10.0 * value) 
 
 std::int64_t nowNanoseconds() { return static_cast<std::int64_t>(ros::Time::now().toNSec()); }
 
-}  // namespace
-
-StereoParameters loadStereoParameters(Parameters& parameters) {
-  StereoParameters result;
-  result.rig = parameters.choice("mode", "stage", {"stage", "rig"}) == "rig";
-  result.lens = parameters.text("lens", "");
-  result.lens_displaced = parameters.text("lens_displaced", "");
-  result.rig_file = parameters.text("rig", "");
-  result.fixed_frame = parameters.frame("fixed_frame", result.fixed_frame);
-  result.matching.mask = loadMask(parameters.text("mask", ""));
-
-  PairingOptions& pairing = result.pairing;
-  pairing.min_baseline = parameters.number("min_baseline", 0.01, 1e-6, 1e3, "m");
-  pairing.max_baseline = parameters.number("max_baseline", 1.0, 1e-6, 1e3, "m");
-  pairing.max_rotation = parameters.number("max_rotation", 0.5, 0.0, 3.2, "rad");
-  pairing.positions = parameters.integer("positions", 1, 1, 16);
-  pairing.settle_time = parameters.number("settle_time", 0.04, 0.0, 10.0, "s");
-  pairing.settle_distance = parameters.number("settle_distance", 2e-4, 0.0, 1.0, "m");
-  pairing.max_wait = parameters.number("max_wait", 1.0, 0.0, 60.0, "s");
-  pairing.max_age = parameters.number("max_age", 0.0, 0.0, 1e6, "s");
-
-  result.max_skew = parameters.number("max_skew", 0.02, 0.0, 1.0, "s");
-  // rviz and others fail on huge coordinates, so a cloud always ends somewhere.
-  result.matching.min_range = parameters.number("min_range", 0.0, 0.0, 1e4, "m");
-  result.matching.max_range = parameters.number("max_range", 50.0, 1e-3, 1e4, "m");
-  result.matching.hypotheses = parameters.integer("hypotheses", 0, 0, 4096);
-  result.matching.threads = parameters.integer("threads", 0, 0, 256);
-  result.matching.refine = parameters.flag("refine", false);
-  const double rate = parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)");
-  result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
-  result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
-  result.preset = parameters.choice("preset", "custom", {"custom", "balanced", "accurate"});
-  result.drift = loadDriftParameters(parameters);
-  result.epipolar_pixels = parameters.text("epipolar_pixels", "");
-  parsePixels(result.epipolar_pixels, "~epipolar_pixels");
-  StereoConfig config = toConfig(result);
-  applyPreset(config);
-  take(config, result);
-  if (result.matching.max_range <= result.matching.min_range)
-    throw InputError("~max_range", "", "is not larger than ~min_range");
-  parameters.warnUnknown();
-  return result;
-}
-
-namespace {
-
 StereoParameters load(const ros::NodeHandle& private_node) {
   Parameters parameters(private_node);
   return loadStereoParameters(parameters);
@@ -167,7 +80,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       live_(parameters_),
       pairing_(parameters_.pairing),
       last_cloud_(ros::SteadyTime::now()),
-      worker_(parameters_.matcher, parameters_.matching),
+      worker_(settingsOf(parameters_)),
       drift_(parameters_.drift),
       diagnostics_(node, private_node, private_node.getNamespace()) {
   const std::vector<std::string> prefixes =
@@ -260,10 +173,28 @@ void StereoPipeline::configure(StereoConfig& config) {
     ROS_WARN("%s", error.what());
     config.epipolar_pixels = before.epipolar_pixels;
   }
+  try {
+    parseRegion(config.roi, eyes_[0].lens ? eyes_[0].lens->image_size : kAnySize, "roi");
+  } catch (const Error& error) {
+    ROS_WARN("%s", error.what());
+    config.roi = before.roi;
+  }
+  try {
+    if (config.mask != before.mask) live_.matching.mask = loadMask(config.mask);
+  } catch (const Error& error) {
+    ROS_WARN("%s", error.what());
+    config.mask = before.mask;
+  }
+  if (config.stream && parameters_.rig) {
+    ROS_WARN("stream is for one camera that moves, not for mode rig");
+    config.stream = false;
+  }
   const auto known = [](const std::string& value, std::initializer_list<const char*> choices) {
     return std::find(choices.begin(), choices.end(), value) != choices.end();
   };
   if (!known(config.matcher, {"sweep", "thesis"})) config.matcher = before.matcher;
+  if (!known(config.cost, {"census", "zncc", "eq3.1"})) config.cost = before.cost;
+  if (!known(config.window, {"surface", "ray", "fronto", "best"})) config.window = before.window;
   if (!known(config.preset, {"custom", "balanced", "accurate"})) config.preset = before.preset;
   StereoConfig preset = config;
   applyPreset(preset);
@@ -311,7 +242,9 @@ void StereoPipeline::onClickedPixel(const geometry_msgs::Point& pixel) {
   const bool inside = eyes_[0].lens && pixel.x >= 0.0 && pixel.y >= 0.0 &&
                       pixel.x < eyes_[0].lens->image_size.width &&
                       pixel.y < eyes_[0].lens->image_size.height;
-  if (inside) pick({pixel.x, pixel.y});
+  // Of a reduced picture; the pixels that are kept are those of the full image.
+  const double factor = live_.reduce;
+  if (inside) pick({(pixel.x + 0.5) * factor - 0.5, (pixel.y + 0.5) * factor - 0.5});
 }
 
 void StereoPipeline::publishLens(const std::string& frame_id) {
@@ -612,21 +545,42 @@ void StereoPipeline::run() {
   }
 }
 
-void StereoPipeline::publishOverlay(const StereoSet& job, const PreparedSet& prepared,
-                                    const StereoParameters& live, const MatchResult& result) {
+void StereoPipeline::publishOverlay(const MatchedSet& matched, const StereoParameters& live) {
   std::vector<cv::Point2d> pixels;
   {
     std::lock_guard<std::mutex> lock(mutex_);
     pixels = clicked_;
   }
   if (pixels.empty()) pixels = parsePixels(live.epipolar_pixels, "epipolar_pixels");
-  if (pixels.empty()) pixels = defaultPixels(prepared.geometry.reference_size);
-  const cv::Mat picture = drawEpipolarOverlay(toBgr(*job.reference, prepared.bits),
-                                              toBgr(*job.displaced.front(), prepared.bits),
-                                              prepared.geometry, live.matching, result, pixels);
-  const sensor_msgs::ImagePtr message = toImage(picture, sensor_msgs::image_encodings::BGR8);
-  message->header = job.reference->header;
+  for (cv::Point2d& pixel : pixels)
+    pixel = (pixel + cv::Point2d(0.5, 0.5)) / live.reduce - cv::Point2d(0.5, 0.5);
+  StereoGeometry geometry;
+  geometry.reference_lens = matched.lens;
+  geometry.reference_size = matched.grey.size();
+  geometry.displaced = {matched.displaced_from};
+  if (pixels.empty()) pixels = defaultPixels(geometry.reference_size);
+  const auto picture = [&](const sensor_msgs::Image& image) {
+    return reducedImage(toBgr(image, matched.bits), live.reduce);
+  };
+  const sensor_msgs::ImagePtr message =
+      toImage(drawEpipolarOverlay(picture(*matched.image), picture(*matched.displaced), geometry,
+                                  live.matching, matched.result, pixels),
+              sensor_msgs::image_encodings::BGR8);
+  message->header = matched.image->header;
   epipolar_publisher_.publish(message);
+}
+
+sensor_msgs::PointCloud2Ptr StereoPipeline::cloudMessage() {
+  // What nobody holds any more is there to be filled again: fresh memory costs milliseconds.
+  for (const sensor_msgs::PointCloud2Ptr& message : cloud_messages_)
+    if (message.unique()) {
+      // Whoever let go of it last has read it before.
+      std::atomic_thread_fence(std::memory_order_acquire);
+      return message;
+    }
+  auto message = boost::make_shared<sensor_msgs::PointCloud2>();
+  if (cloud_messages_.size() < kCloudsKept) cloud_messages_.push_back(message);
+  return message;
 }
 
 void StereoPipeline::process(const StereoSet& job) {
@@ -649,33 +603,52 @@ void StereoPipeline::process(const StereoSet& job) {
   // A lens may have come after the images.
   const LensFile& reference_lens = lenses.front();
   const LensFile& displaced_lens = lenses.back();
-  const PreparedSet prepared = StereoWorker::prepare(job, reference_lens, displaced_lens,
-                                                     eyes_.front().topic, eyes_.back().topic);
-  publishLens(job.reference->header.frame_id);
-  laps.lap("convert");
   if (generation != worker_generation_) {
-    worker_.configure(live.matcher, live.matching);
+    worker_.configure(settingsOf(live));
     worker_generation_ = generation;
   }
-  Matcher& matcher = worker_.matcherFor(prepared.geometry);
+  const PreparedSet prepared =
+      worker_.prepare(job, reference_lens, displaced_lens, eyes_.front().topic, eyes_.back().topic);
+  publishLens(job.reference->header.frame_id);
+  laps.lap("convert");
+  if (!live.stream) worker_.matcherFor(prepared.geometry);
   laps.lap("prepare");
-  const MatchResult result = matcher.match(prepared.reference, prepared.displaced);
+  StereoSet placed = job;
+  if (parameters_.rig && live.use_prior) {
+    // Where the cameras stand, if anybody says; only that takes a prior along.
+    const std_msgs::Header& header = job.reference->header;
+    const PoseAnswer answer =
+        cameraPose(header.frame_id, static_cast<std::int64_t>(header.stamp.toNSec()));
+    if (answer.state == PoseAnswer::State::kKnown) placed.T_fixed_reference = answer.T_fixed_camera;
+  }
+  const std::optional<MatchedSet> matched = worker_.match(placed, prepared);
+  if (!matched)
+    return drop("no baseline", "the camera stands where the stream's reference was taken", false);
+  const MatchResult& result = matched->result;
   laps.lap("match");
 
-  const std_msgs::Header& header = job.reference->header;
-  const bool points_wanted = points_publisher_.getNumSubscribers() > 0;
-  if (points_wanted || depth_publisher_.getNumSubscribers() > 0) {
-    const Cloud cloud = worker_.points(job, prepared, result, reference_lens, points_wanted);
-    if (points_wanted) points_publisher_.publish(toPointCloud(cloud, header));
-    if (depth_publisher_.getNumSubscribers() > 0) depth_publisher_.publish(toDepth(cloud, header));
+  const std_msgs::Header& header = matched->image->header;
+  if (points_publisher_.getNumSubscribers() > 0) {
+    const sensor_msgs::PointCloud2Ptr message = cloudMessage();
+    fillPointCloud(result, worker_.rays(*matched), worker_.picture(*matched, true), header,
+                   live.matching.threads, message.get());
+    points_publisher_.publish(message);
   }
+  if (depth_publisher_.getNumSubscribers() > 0)
+    depth_publisher_.publish(toDepth(result.range, worker_.rays(*matched), header));
   if (range_publisher_.getNumSubscribers() > 0)
     range_publisher_.publish(toRange(result.range, header));
 
   laps.lap("publish");
   if (epipolar_publisher_.getNumSubscribers() > 0) {
-    publishOverlay(job, prepared, live, result);
+    publishOverlay(*matched, live);
     laps.lap("overlay");
+  }
+  // Of a cloud that is next to nothing: what is wrong with its images.
+  std::string remark;
+  if (result.statistics.valid * 20 < matched->grey.total()) {
+    for (const std::string& line : imageRemarks(prepared.reference, prepared.displaced))
+      remark += (remark.empty() ? "" : "; ") + line;
   }
 
   StageTimes times;
@@ -689,13 +662,16 @@ void StereoPipeline::process(const StereoSet& job) {
   }
   times.age = (ros::Time::now() - header.stamp).toSec();
   times_publisher_.publish(times);
-  drift_.look(job, prepared, result.range);
+  // A stream's ranges lie on the pixels of another image.
+  if (matched->image == job.reference) drift_.look(job, prepared, result.range);
 
   std::lock_guard<std::mutex> lock(mutex_);
   ++clouds_;
   last_cloud_ = ros::SteadyTime::now();
   last_statistics_ = result.statistics;
   last_statistics_.seconds = laps.seconds();
+  last_positions_ = matched->positions;
+  last_remark_ = remark;
   reason_.clear();
 }
 
@@ -728,6 +704,8 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
     status.summary(DiagnosticStatus::OK, "idle: nobody listens");
   else if (!silent.empty())
     status.summary(DiagnosticStatus::WARN, "no cloud: " + printable(silent, 300));
+  else if (clouds_ > 0 && !last_remark_.empty())
+    status.summary(DiagnosticStatus::WARN, "clouds are nearly empty: " + last_remark_);
   else if (clouds_ > 0 && last_statistics_.valid == 0)
     status.summary(DiagnosticStatus::WARN,
                    "clouds are empty: every pixel is rejected, most by the test '" +
@@ -741,6 +719,7 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
   status.add("clouds", clouds_);
   if (clouds_ > 0) {
     status.add("valid pixels", last_statistics_.valid);
+    status.add("displaced images", last_positions_);
     for (const auto& [stage, seconds] : last_statistics_.seconds)
       status.add("seconds, " + stage, seconds);
     for (const auto& [test, pixels] : last_statistics_.rejected)

@@ -90,6 +90,14 @@ double longestPath(const StereoGeometry& geometry, double w_begin, double w_end)
 
 }  // namespace
 
+void checkPrior(const StereoGeometry& geometry, const cv::Mat& prior) {
+  if (prior.empty() || (prior.type() == CV_32FC1 && prior.size() == geometry.reference_size))
+    return;
+  throw Error("prior range is " + sizeText(prior.size()) +
+              ", expected one 32-bit float channel of " + sizeText(geometry.reference_size) +
+              " like the reference image");
+}
+
 MatchingLimits checkMatching(const StereoGeometry& geometry, const MatcherOptions& options) {
   if (!geometry.reference_lens) throw Error("the reference camera has no lens");
   checkSize(geometry.reference_size, "reference image");
@@ -142,12 +150,7 @@ MatchingLimits checkMatching(const StereoGeometry& geometry, const MatcherOption
                 " like the reference image");
   }
 
-  if (!options.prior.empty() &&
-      (options.prior.type() != CV_32FC1 || options.prior.size() != geometry.reference_size)) {
-    throw Error("prior range is " + sizeText(options.prior.size()) +
-                ", expected one 32-bit float channel of " + sizeText(geometry.reference_size) +
-                " like the reference image");
-  }
+  checkPrior(geometry, options.prior);
 
   limits.longest_path_px =
       longestPath(geometry, limits.minInverseRange(), limits.maxInverseRange());

@@ -171,6 +171,12 @@ class MultiPositionMatcher : public Matcher {
     }
   }
 
+  bool setPrior(const cv::Mat& prior) override {
+    checkPrior(geometry_, prior);
+    options_.prior = prior.clone();
+    return true;
+  }
+
   MatchResult match(const cv::Mat& reference, const std::vector<cv::Mat>& displaced) override {
     checkImages(geometry_, reference, displaced);
     const auto start = std::chrono::steady_clock::now();

@@ -329,6 +329,7 @@ class CalibratedMatcher : public Matcher {
     uncertainty_.addTo(&result);
     return result;
   }
+  bool setPrior(const cv::Mat& prior) override { return matcher_->setPrior(prior); }
 
  private:
   std::unique_ptr<Matcher> matcher_;

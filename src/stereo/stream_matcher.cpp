@@ -11,7 +11,6 @@
 #include "omnister/common/error.h"
 #include "omnister/stereo/matching_limits.h"
 #include "range_uncertainty.h"
-#include "sweep_kernels.h"
 #include "sweep_pair.h"
 
 namespace omnister {
@@ -90,7 +89,6 @@ MatchResult StreamMatcher::add(const StereoGeometry::Displaced& camera, const cv
   geometry.displaced = {camera};
   checkMatching(geometry, state.options);
   checkImages(geometry, state.reference, {image});
-  sweep::holdSimdByEnvironment();
   auto pair = makeSweepPair(geometry, state.options);
   if (state.pair) pair->takeBuffers(state.pair.get());
   state.pair = std::move(pair);

@@ -4,6 +4,7 @@
 #include <utility>
 
 #include "omnister/common/parallel.h"
+#include "sweep_cost.h"
 #include "sweep_level.h"
 
 namespace omnister::sweep {
@@ -13,8 +14,8 @@ constexpr int kBlock = 16;  ///< pixels that share a local epipolar frame
 
 }  // namespace
 
-void describeDisplaced(Level* level, int threads, const std::function<Scratch&()>& local,
-                       std::vector<std::uint16_t>* pairs) {
+void describeDisplaced(const CostFunction& cost, Level* level, int threads,
+                       const std::function<Scratch&()>& local, std::vector<std::uint16_t>* pairs) {
   constexpr int kStrip = 24;
   const Grid& grid = level->grid;
   // Four pixels around a cell are then one word.
@@ -60,7 +61,7 @@ void describeDisplaced(Level* level, int threads, const std::function<Scratch&()
         std::uint8_t* out[kPlanes];
         for (int p = 0; p < kPlanes; ++p)
           out[p] = &level->cells[p][level->slack + band.origin[r] + band.begin[r]];
-        censusRow(rows, band.runs[r] * 8, out);
+        cost.describeRow(rows, band.runs[r] * 8, out);
       }
     });
   }

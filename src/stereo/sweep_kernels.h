@@ -148,7 +148,10 @@ struct ConcludeJob {
   std::int32_t cells = 0;
   float step_h = 0;
   float guess = 0, guess_x = 0;  ///< as in MapJob, from the row's first pixel
-  float worst_cost = 0;
+  float worst_cost = 0;          ///< in the units of costs
+  /// Costs near the least are a parabola. `steep` is then what gives TriangulateJob the spread of
+  /// such a least: it goes with the root of the rise.
+  bool parabola = false;
   float* h = nullptr;              ///< [out] NaN where nothing was found
   std::uint16_t* steep = nullptr;  ///< [out] rise of cost to the higher neighbour; may be null
   // Where the match falls on the claims image; skipped when claim is null.
@@ -196,6 +199,8 @@ void medianRow(const float* const rows[3], int count, float* out);
 /// Spread of a hypothesis [columns] times the slope of its cost over the root of the cost; as
 /// measured on rendered scenes with image noise of one grey level.
 inline constexpr float kSigmaOfCost = 0.44f;
+/// Of the root of the rise of a parabola, so that kSigmaOfCost holds for it as well.
+inline constexpr float kSteepOfParabola = 0.77f;
 
 struct TriangulateJob {
   int count = 0;

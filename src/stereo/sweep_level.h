@@ -7,6 +7,7 @@
 #include <utility>
 #include <vector>
 
+#include "omnister/stereo/matcher.h"
 #include "sweep_geometry.h"
 #include "sweep_kernels.h"
 
@@ -59,11 +60,13 @@ struct Scratch {
   std::vector<float> rows[3], nothing;  ///< between two filters
 };
 
+class CostFunction;
+
 /// Descriptors of the displaced image along its epipolar curves.
 /// @param scratch gives that of the calling thread
 /// @param pairs room to work in
-void describeDisplaced(Level* level, int threads, const std::function<Scratch&()>& scratch,
-                       std::vector<std::uint16_t>* pairs);
+void describeDisplaced(const CostFunction& cost, Level* level, int threads,
+                       const std::function<Scratch&()>& scratch, std::vector<std::uint16_t>* pairs);
 
 /// Census of the tile's pixels and halo in the local epipolar frames, to Scratch::reference.
 /// @param finest whether the level is the one of full resolution
@@ -74,5 +77,10 @@ void describeTile(const Level& level, bool finest, const Tile& tile, const Band&
 /// Scratch::guesses; at least one.
 /// @param coarse CV_32FC1, its hypotheses; null for the coarsest level: all hypotheses
 void guessTile(const cv::Mat* coarse, const Tile& tile, const Band& band, Scratch* scratch);
+
+/// Turns the windows of Scratch::guesses from those surfaces into planes of a given orientation;
+/// what is searched stays. @param frame of the pair; Scratch::view holds the tile
+void orientGuesses(MatchWindow window, const EpipolarFrame& frame, const Band& band,
+                   const Tile& tile, Scratch* scratch);
 
 }  // namespace omnister::sweep

@@ -17,6 +17,7 @@
 #include "omnister/common/parallel.h"
 #include "omnister/stereo/matching_limits.h"
 #include "range_uncertainty.h"
+#include "sweep_cost.h"
 #include "sweep_fill.h"
 #include "sweep_filters.h"
 #include "sweep_geometry.h"
@@ -79,7 +80,10 @@ cv::Mat makePlane(cv::Size size, int type, double value = -1) {
 class SweepMatcher : public SweepPair {
  public:
   SweepMatcher(const StereoGeometry& geometry, const MatcherOptions& options)
-      : geometry_(geometry), options_(options), weak_fill_(geometry, options.threads) {
+      : geometry_(geometry),
+        options_(options),
+        compare_(costFunction(options.cost)),
+        weak_fill_(geometry, options.threads) {
     const auto& displaced = geometry.displaced.front();
     frame_ = makeEpipolarFrame(displaced.T_ref_disp.translation());
     const WideLens reference_lens = widen(geometry.reference_lens);
@@ -142,7 +146,8 @@ class SweepMatcher : public SweepPair {
     watch.lap("prefilter");
     for (Level& level : levels_)
       describeDisplaced(
-          &level, options_.threads, [this]() -> Scratch& { return scratch_->local(); }, &pairs_);
+          compare_, &level, options_.threads, [this]() -> Scratch& { return scratch_->local(); },
+          &pairs_);
     watch.lap("describe");
     for (std::size_t l = levels_.size(); l-- > 0;) {
       matchLevel(l);
@@ -264,6 +269,7 @@ class SweepMatcher : public SweepPair {
     viewMap(level.map,
             rect + cv::Size(2 * kViewHalo, 2 * kViewHalo) - cv::Point(kViewHalo, kViewHalo),
             &scratch->view);
+    orientGuesses(options_.window, frame_, band, tile, scratch);
     // Cells of a row of the tile with its halo, from column `from` on.
     const auto mapTile = [&](const Guess& guess, int y, int from, int count) {
       const std::size_t at = view.at(rect.x - kRadius + from, rect.y - kRadius + y);
@@ -273,7 +279,7 @@ class SweepMatcher : public SweepPair {
       mapRow(map_job, &view.phi[at], &view.a[at], count, &scratch->base[y * stride + from],
              &scratch->residual[y * stride + from]);
     };
-    describeTile(level, l == 0, tile, band, stride, scratch);
+    compare_.describeTile(level, l == 0, tile, band, stride, scratch);
 
     const std::size_t inner = rect.area() + 64;
     scratch->cost.resize(inner);
@@ -312,7 +318,7 @@ class SweepMatcher : public SweepPair {
       for (const auto& [from, to] : guess.intervals) {
         for (job.first = from - 1; job.first < to; job.first += job.lanes - 2) {
           job.lanes = to - job.first < 15 ? 16 : 32;
-          matchChunk(job);
+          compare_.matchChunk(job);
           job.fresh = false;
         }
       }
@@ -372,7 +378,9 @@ class SweepMatcher : public SweepPair {
     job.cells = level.grid.cells;
     job.step_h = static_cast<float>(band.step_h);
     job.guess_x = guess.x;
-    job.worst_cost = kWorstShare * kFullCost;
+    const int shift = compare_.shift();
+    job.worst_cost = kWorstShare * kFullCost * static_cast<float>(1 << shift);
+    job.parabola = compare_.isParabola();
     job.claim_x = claim_x_;
     job.claim_y = claim_x_;
     job.claim_y_offset = claim_y_offset_;
@@ -418,7 +426,8 @@ class SweepMatcher : public SweepPair {
       concludeRow(&job);
       if (!merge) {
         std::copy_n(job.cost, where.width, best);
-        if (l == 0) std::copy_n(job.cost, where.width, cost);
+        if (l == 0)
+          for (int x = 0; x < where.width; ++x) cost[x] = job.cost[x] >> shift;
         // Vectors wrote past the end of the row.
         if (where.br().x == level.h.cols) std::fill_n(h + where.width, 16, kNaN);
         continue;
@@ -428,7 +437,7 @@ class SweepMatcher : public SweepPair {
       if (l == 0) {
         for (int x = 0; x < where.width; ++x) {
           steep[x] = job.cost[x] < best[x] ? job.steep[x] : steep[x];
-          cost[x] = std::min(cost[x], job.cost[x]);
+          cost[x] = std::min<std::uint16_t>(cost[x], job.cost[x] >> shift);
         }
         for (int x = 0; x < where.width; ++x)
           claim[x] = job.cost[x] < best[x] ? job.claim[x] : claim[x];
@@ -650,6 +659,7 @@ class SweepMatcher : public SweepPair {
 
   StereoGeometry geometry_;
   MatcherOptions options_;
+  const CostFunction& compare_;
   WeakFill weak_fill_;
   EpipolarFrame frame_;
   std::vector<Level> levels_;
@@ -667,8 +677,9 @@ class SweepMatcher : public SweepPair {
 
 }  // namespace
 
-std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
-                                          const MatcherOptions& options) {
+namespace {
+
+void checkSweep(const StereoGeometry& geometry, const MatcherOptions& options) {
   checkMatching(geometry, options);
   sweep::holdSimdByEnvironment();
   // What a pair takes for each pixel, and the descriptors of each displaced image.
@@ -677,6 +688,13 @@ std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
   for (const auto& displaced : geometry.displaced)
     bytes += 20 * std::max(pixels, static_cast<double>(displaced.size.area()));
   checkMemory(bytes, "the sweep");
+}
+
+}  // namespace
+
+std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
+                                          const MatcherOptions& options) {
+  checkSweep(geometry, options);
   std::unique_ptr<Matcher> matcher;
   if (geometry.displaced.size() > 1 || options.refine || !options.prior.empty())
     matcher = makeMultiPositionMatcher(geometry, options);
@@ -687,7 +705,7 @@ std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
 
 std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,
                                          const MatcherOptions& options) {
-  checkMatching(geometry, options);
+  checkSweep(geometry, options);
   return std::make_unique<SweepMatcher>(geometry, options);
 }
 

@@ -51,9 +51,9 @@ void ConcludeRow(ConcludeJob* in_out) {
     fine = hn::And(fine, hn::Le(c, hn::Set(df, job.worst_cost)));
     // The pixels of a window fall between columns, each elsewhere: their sum is rounder than two
     // lines and sharper than a parabola. With this gain a shift of all columns leaves no bias.
-    constexpr float kGain = 0.62f;
+    constexpr float kGain = 0.62f, kParabola = 0.5f;
     const auto shift =
-        hn::Div(hn::Mul(hn::Sub(before, after), hn::Set(df, kGain)),
+        hn::Div(hn::Mul(hn::Sub(before, after), hn::Set(df, job.parabola ? kParabola : kGain)),
                 hn::Max(hn::Sub(hn::Add(before, after), hn::Add(c, c)), hn::Set(df, 1.0f)));
     const auto guess = hn::Add(hn::Mul(hn::ConvertTo(df, Count(di, x)), hn::Set(df, job.guess_x)),
                                hn::Set(df, job.guess));
@@ -62,8 +62,9 @@ void ConcludeRow(ConcludeJob* in_out) {
     const auto h = hn::Mul(hn::Add(columns, guess), hn::Set(df, job.step_h));
     hn::StoreU(hn::IfThenElse(fine, h, hn::NaN(df)), df, job.h + x);
     if (job.steep) {
-      hn::StoreU(hn::DemoteTo(du16, hn::ConvertTo(di, hn::Max(steep, hn::Zero(df)))), du16,
-                 job.steep + x);
+      auto rise = hn::Max(steep, hn::Zero(df));
+      if (job.parabola) rise = hn::Mul(hn::Sqrt(rise), hn::Set(df, kSteepOfParabola));
+      hn::StoreU(hn::DemoteTo(du16, hn::ConvertTo(di, rise)), du16, job.steep + x);
     }
     if (job.claim) {
       const auto theta = hn::Add(hn::LoadU(df, job.a + x), h);

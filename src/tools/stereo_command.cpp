@@ -24,6 +24,7 @@
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/reduced_lens.h"
 #include "omnister/stereo/cloud.h"
+#include "omnister/stereo/input_region.h"
 #include "omnister/stereo/matcher.h"
 #include "omnister/stereo/matching_limits.h"
 #include "omnister/stereo/thesis_matcher.h"
@@ -147,35 +148,6 @@ void checkFiles(const StereoArguments& arguments) {
   checkOutputs(inputs, {arguments.cloud, arguments.range});
 }
 
-// Means over squares of pixels; what is left over at the right and below is cut off.
-cv::Mat reduced(const cv::Mat& image, int factor) {
-  if (factor == 1) return image;
-  cv::Mat small;
-  const cv::Size size = image.size() / factor;
-  cv::resize(image(cv::Rect(cv::Point(), size * factor)), small, size, 0, 0, cv::INTER_AREA);
-  return small;
-}
-
-// "x,y,width,height" inside an image.
-cv::Rect parseRegion(const std::string& text, cv::Size size) {
-  std::vector<double> numbers;
-  std::istringstream stream(text);
-  std::string field;
-  while (std::getline(stream, field, ',')) {
-    const auto number = parseNumber(field);
-    if (!number || *number != std::floor(*number) || std::abs(*number) > 1e6) break;
-    numbers.push_back(*number);
-  }
-  if (numbers.size() == 4 && stream.eof() && numbers[0] >= 0 && numbers[1] >= 0 &&
-      numbers[2] >= 1 && numbers[3] >= 1 && numbers[0] + numbers[2] <= size.width &&
-      numbers[1] + numbers[3] <= size.height) {
-    return {static_cast<int>(numbers[0]), static_cast<int>(numbers[1]),
-            static_cast<int>(numbers[2]), static_cast<int>(numbers[3])};
-  }
-  throw Error("--roi is '" + printable(text) + "', expected x,y,width,height inside the " +
-              sizeText(size) + " reference image");
-}
-
 cv::Mat readPrior(const std::string& path, cv::Size size) {
   const cv::Mat prior = readImage(path);
   if (prior.type() != CV_32FC1 || prior.size() != size) {
@@ -211,8 +183,7 @@ struct Inputs {
 };
 
 // Everything in a smaller image, with the lens of that image.
-void reduceInputs(StereoArguments& arguments, Inputs* inputs) {
-  const int factor = arguments.reduce;
+void reduceInputs(int factor, Inputs* inputs) {
   StereoGeometry& geometry = inputs->geometry;
   // What is one lens stays one.
   std::map<LensPtr, LensPtr> lenses;
@@ -228,12 +199,9 @@ void reduceInputs(StereoArguments& arguments, Inputs* inputs) {
   };
   shrink(geometry.reference_lens, geometry.reference_size, "reference");
   for (auto& displaced : geometry.displaced) shrink(displaced.lens, displaced.size, "displaced");
-  inputs->reference = reduced(inputs->reference, factor);
-  inputs->color = reduced(inputs->color, factor);
-  for (cv::Mat& image : inputs->displaced) image = reduced(image, factor);
-  cv::Mat& mask = arguments.options.mask;
-  // A reduced pixel is left out if any part of it is.
-  if (!mask.empty()) mask = reduced(mask, factor) == 255;
+  inputs->reference = reducedImage(inputs->reference, factor);
+  inputs->color = reducedImage(inputs->color, factor);
+  for (cv::Mat& image : inputs->displaced) image = reducedImage(image, factor);
 }
 
 Inputs readInputs(StereoArguments& arguments) {
@@ -292,22 +260,18 @@ Inputs readInputs(StereoArguments& arguments) {
   inputs.reference = greyOf(inputs.color);
   if (inputs.color.channels() == 4) cv::cvtColor(inputs.color, inputs.color, cv::COLOR_BGRA2BGR);
   for (cv::Mat& image : inputs.displaced) image = greyOf(image);
+  cv::Mat mask;
   if (!arguments.mask.empty()) {
-    cv::Mat mask = readImage(arguments.mask, ImageColor::kGray);
+    mask = readImage(arguments.mask, ImageColor::kGray);
     if (mask.size() != lens.image_size) {
       throw InputError(arguments.mask, "",
                        "is " + sizeText(mask.size()) + ", but the lens " +
                            printable(arguments.lens) + " is for " + sizeText(lens.image_size));
     }
-    arguments.options.mask = mask != 0;
   }
-  if (!arguments.roi.empty()) {
-    cv::Mat region(lens.image_size, CV_8UC1, cv::Scalar(0));
-    region(parseRegion(arguments.roi, lens.image_size)).setTo(255);
-    if (!arguments.options.mask.empty()) region &= arguments.options.mask;
-    arguments.options.mask = region;
-  }
-  if (arguments.reduce > 1) reduceInputs(arguments, &inputs);
+  const cv::Rect region = parseRegion(arguments.roi, lens.image_size, "--roi");
+  if (arguments.reduce > 1) reduceInputs(arguments.reduce, &inputs);
+  arguments.options.mask = matchingMask(mask, region, lens.image_size, arguments.reduce);
   if (!arguments.prior.empty())
     arguments.options.prior = readPrior(arguments.prior, inputs.geometry.reference_size);
   return inputs;
@@ -335,9 +299,13 @@ void runStereo(StereoArguments& arguments, bool json) {
   cv::setNumThreads(threadCount(std::clamp(arguments.options.threads, 0, kMaxThreads)));
 
   auto start = Clock::now();
-  if (arguments.matcher == "thesis" && (arguments.options.refine || !arguments.prior.empty())) {
-    throw Error(std::string(arguments.options.refine ? "--refine" : "--prior") +
-                " is for the sweep, not for the thesis' matcher");
+  const char* for_the_sweep = arguments.options.refine                            ? "--refine"
+                              : !arguments.prior.empty()                          ? "--prior"
+                              : arguments.options.cost != MatchCost::kCensus      ? "--cost"
+                              : arguments.options.window != MatchWindow::kSurface ? "--window"
+                                                                                  : nullptr;
+  if (arguments.matcher == "thesis" && for_the_sweep != nullptr) {
+    throw Error(std::string(for_the_sweep) + " is for the sweep, not for the thesis' matcher");
   }
   if (arguments.reduce < 1 || arguments.reduce > 64) {
     throw Error("--reduce is " + std::to_string(arguments.reduce) + ", expected 1 to 64");
@@ -474,6 +442,25 @@ void addStereo(CLI::App& app) {
   command->add_option("--matcher", arguments->matcher, "How to match")
       ->check(CLI::IsMember({"sweep", "thesis"}))
       ->capture_default_str();
+  command
+      ->add_option_function<std::string>(
+          "--cost",
+          [arguments](const std::string& name) { arguments->options.cost = parseMatchCost(name); },
+          "How the sweep compares windows: census, zncc (grey values without their means) or eq3.1 "
+          "of the thesis (grey values as they are: for images of one exposure)")
+      ->check(CLI::IsMember({"census", "zncc", "eq3.1"}))
+      ->default_str("census");
+  command
+      ->add_option_function<std::string>(
+          "--window",
+          [arguments](const std::string& name) {
+            arguments->options.window = parseMatchWindow(name);
+          },
+          "How the sweep's windows stand: as the surfaces seen in coarser images, normal to the "
+          "ray, "
+          "parallel to the image plane (fronto), or the better of these two (best)")
+      ->check(CLI::IsMember({"surface", "ray", "fronto", "best"}))
+      ->default_str("surface");
   command
       ->add_option("--thesis-mask", arguments->thesis_mask,
                    "Mask of the thesis matcher: a square of dewarped space (fig5.4) or of distinct "

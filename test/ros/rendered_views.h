@@ -27,6 +27,16 @@ inline LensFile lensFile() {
   return file;
 }
 
+/// The room as a camera sees it that stands `x` metres to the right.
+inline sim::Rendering roomFrom(double x, const LensFile& lens = lensFile()) {
+  const sim::ScenePtr scene =
+      sim::readScene(std::string(OMNISTER_SOURCE_DIR) + "/config/scenes/room.yaml");
+  sim::RenderOptions options;
+  options.adaptive = true;
+  return sim::Renderer(*lens.lens, lens.image_size)
+      .render(*scene, Pose(Eigen::Translation3d(x, 0, 0)), options);
+}
+
 /// Two rendered views of the room, a step to the right apart, and the truth of the second.
 struct Views {
   LensFile lens = lensFile();
@@ -35,14 +45,8 @@ struct Views {
   cv::Mat right_range;
 
   Views() {
-    const sim::ScenePtr scene =
-        sim::readScene(std::string(OMNISTER_SOURCE_DIR) + "/config/scenes/room.yaml");
-    const sim::Renderer renderer(*lens.lens, lens.image_size);
-    sim::RenderOptions options;
-    options.adaptive = true;
-    left = renderer.render(*scene, Pose::Identity(), options).image;
-    const sim::Rendering rendering =
-        renderer.render(*scene, Pose(Eigen::Translation3d(kBaseline, 0, 0)), options);
+    left = roomFrom(0.0, lens).image;
+    const sim::Rendering rendering = roomFrom(kBaseline, lens);
     right = rendering.image;
     right_range = rendering.range;
   }

@@ -9,6 +9,8 @@
 #include "omnister/device/replay_camera.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/scan_server.h"
+#include "omnister/ros/stereo_pipeline.h"
+#include "ros/rendered_views.h"
 #include "ros/rig_drivers.h"
 #include "ros/ros_test.h"
 
@@ -82,11 +84,11 @@ class Scan : public testing::Test {
   void SetUp() override {
     SimRigParameters parameters;
     parameters.scene = kSource + "/config/scenes/room.yaml";
-    parameters.lens = kSource + "/test/data/replay/lens.yaml";
+    parameters.lens = lens_;
     parameters.stage.homed = true;
     parameters.stage.start_m = 0.0;
     parameters.stage.acceleration_mps2 = 2.0;
-    parameters.camera.frame_rate_hz = 20.0;
+    parameters.camera.frame_rate_hz = frame_rate_;
     rig_ = std::make_unique<test::RigWithDrivers>(node_, ros::NodeHandle("~rig"), parameters);
     ScanParameters scan;
     scan.stop_timeout_s = 60.0;
@@ -109,6 +111,8 @@ class Scan : public testing::Test {
         device::Stamp(std::chrono::nanoseconds(frame.header.stamp.toNSec())));
   }
 
+  std::string lens_ = kSource + "/test/data/replay/lens.yaml";
+  double frame_rate_ = 20.0;
   ros::NodeHandle node_{"scan_rig"};
   // The scan takes what the drivers of the rig say, as by the remappings of scan.launch.
   std::unique_ptr<test::RigWithDrivers> rig_;
@@ -195,6 +199,48 @@ TEST_F(Scan, SweepsTagImagesInMotion) {
     }
   }
   EXPECT_GE(moving, 2);
+}
+
+/// With images that are large enough to be matched.
+class ScanOfTheRoom : public Scan {
+ protected:
+  ScanOfTheRoom() {
+    lens_ = (folder_.path() / "lens.yaml").string();
+    frame_rate_ = 5.0;
+    writeLensFile(lens_, test::lensFile());
+  }
+};
+
+TEST_F(ScanOfTheRoom, FeedsTheStereoNode) {
+  ros::NodeHandle private_node("~scan_stereo");
+  private_node.setParam("lens", lens_);
+  private_node.setParam("min_baseline", 0.05);
+  private_node.setParam("max_baseline", 0.15);
+  private_node.setParam("max_range", 20.0);
+  // Its images are those of the scan on which all stood still.
+  const ros::NodeHandle scan_node(node_, "scan");
+  const StereoPipeline stereo(scan_node, private_node);
+  Collector<sensor_msgs::Image> ranges(scan_node, "range");
+  ScanGoal goal;
+  goal.positions = {0.0, 0.1, 0.2};
+  goal.speed = 0.1;
+  // The first images may come before tf and images of the rig are heard.
+  for (int run_number = 0; run_number < 5 && ranges.size() == 0; ++run_number) {
+    ASSERT_EQ(run(goal), SimpleClientGoalState::SUCCEEDED) << client_.getResult()->message;
+    eventually([&] { return ranges.size() > 0; }, 5.0);
+  }
+  ASSERT_GT(ranges.size(), 0u);
+  const sensor_msgs::Image& message = *ranges.last();
+  EXPECT_EQ(message.header.frame_id, "camera_optical");
+  const double x = rig_->rig().stage().truePosition(
+      device::Stamp(std::chrono::nanoseconds(message.header.stamp.toNSec())));
+  const cv::Mat truth = test::roomFrom(x).range;
+  const cv::Mat range(static_cast<int>(message.height), static_cast<int>(message.width), CV_32FC1,
+                      const_cast<std::uint8_t*>(message.data.data()), message.step);
+  ASSERT_EQ(range.size(), truth.size());
+  double share = 0.0;
+  EXPECT_LT(test::medianError(range, truth, &share), 0.02);
+  EXPECT_GT(share, 0.5);
 }
 
 TEST_F(Scan, CancelReallyStopsTheStage) {

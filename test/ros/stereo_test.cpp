@@ -17,6 +17,7 @@
 #include <memory>
 #include <mutex>
 #include <opencv2/core.hpp>
+#include <opencv2/imgcodecs.hpp>
 #include <opencv2/imgproc.hpp>
 
 #include "omnister/calibration/rig_file.h"
@@ -340,6 +341,197 @@ TEST(Stereo, IsTunedLiveWithinItsLimits) {
   EXPECT_GT(parts, 0.5 * whole);
 }
 
+TEST(Stereo, RegionReductionAndMaskChangeWhileItRuns) {
+  Camera camera("cut");
+  const ros::NodeHandle private_node = parametersFor(camera, "cut");
+  const StereoPipeline stereo(camera.node(), private_node);
+  Collector<sensor_msgs::PointCloud2> points(camera.node(), "points2");
+  Collector<sensor_msgs::Image> overlays(camera.node(), "epipolar");
+  double lap = 0.0;
+  const ros::Time start = ros::Time::now();
+  const auto nextCloud = [&] {
+    lap += 4.0;
+    const ros::Time last = start + ros::Duration(lap + 2.0);
+    publishPair(camera, start + ros::Duration(lap), last);
+    // The first of the pair makes a cloud with the frame before; it may come or not.
+    const auto isLast = [&](const auto& collector) {
+      return collector.last() && collector.last()->header.stamp == last;
+    };
+    EXPECT_TRUE(eventually([&] { return isLast(points) && isLast(overlays); }));
+    return fromPointCloud(*points.last());
+  };
+  const auto known = [](const Cloud& cloud, int u, int v) {
+    return !std::isnan(cloud.sigma.at<float>(v, u));
+  };
+  const Cloud whole = nextCloud();
+  ASSERT_EQ(whole.sigma.size(), cv::Size(400, 300));
+
+  StereoConfig now = configure(private_node, [](StereoConfig& c) {
+    c.reduce = 2;
+    c.roi = "100,60,200,180";
+    c.cost = "zncc";
+    c.window = "best";
+  });
+  EXPECT_EQ(now.reduce, 2);
+  EXPECT_EQ(now.roi, "100,60,200,180");
+  EXPECT_EQ(now.cost, "zncc");
+  EXPECT_EQ(now.window, "best");
+  const Cloud half = nextCloud();
+  ASSERT_EQ(half.sigma.size(), cv::Size(200, 150));
+  EXPECT_EQ(overlays.last()->width, 400u) << "both images side by side, reduced";
+  std::vector<double> apart;
+  for (int v = 0; v < 150; ++v) {
+    for (int u = 0; u < 200; ++u) {
+      if (!known(half, u, v)) continue;
+      ASSERT_TRUE(cv::Rect(50, 30, 100, 90).contains(cv::Point(u, v)));
+      // Honest geometry: the ray is that of the middle of four pixels.
+      const cv::Vec3f p = half.xyz.at<cv::Vec3f>(v, u);
+      const auto ray = views().lens.lens->unproject({2 * u + 0.5, 2 * v + 0.5});
+      ASSERT_TRUE(ray);
+      const double range = cv::norm(p);
+      for (int i = 0; i < 3; ++i) ASSERT_NEAR(p[i] / range, (*ray)[i], 1e-5) << u << " " << v;
+      const float truth = views().right_range.at<float>(2 * v, 2 * u);
+      if (!std::isnan(truth)) apart.push_back(std::abs(range / truth - 1.0));
+    }
+  }
+  ASSERT_GT(apart.size(), 5000u);
+  std::nth_element(apart.begin(), apart.begin() + apart.size() / 2, apart.end());
+  // Of so few pixels; the pixel beside is up to that far off on slanted walls.
+  EXPECT_LT(apart[apart.size() / 2], 0.05);
+
+  const std::string mask = (std::filesystem::path(lensPath()).parent_path() / "mask.png").string();
+  cv::Mat robot(300, 400, CV_8UC1, cv::Scalar(255));
+  robot(cv::Rect(200, 0, 200, 300)).setTo(0);
+  ASSERT_TRUE(cv::imwrite(mask, robot));
+  configure(private_node, [&](StereoConfig& c) {
+    c.reduce = 1;
+    c.roi = "";
+    c.mask = mask;
+    c.cost = "eq3.1";
+    c.window = "surface";
+  });
+  const Cloud masked = nextCloud();
+  ASSERT_EQ(masked.sigma.size(), cv::Size(400, 300));
+  EXPECT_EQ(cv::countNonZero(masked.sigma(cv::Rect(200, 0, 200, 300)) > 0), 0);
+  EXPECT_GT(cv::countNonZero(masked.sigma(cv::Rect(0, 0, 200, 300)) > 0), 10000);
+
+  // What cannot be stays as it was, and who asked is told.
+  now = configure(private_node, [](StereoConfig& c) {
+    c.roi = "0,0,1000,1000";
+    c.mask = "/none.png";
+    c.cost = "magic";
+    c.window = "magic";
+  });
+  EXPECT_EQ(now.roi, "");
+  EXPECT_EQ(now.mask, mask);
+  EXPECT_EQ(now.cost, "eq3.1");
+  EXPECT_EQ(now.window, "surface");
+}
+
+TEST(Stereo, AStreamGetsBetterWithTheTravel) {
+  Camera camera("stream");
+  ros::NodeHandle private_node = parametersFor(camera, "stream");
+  private_node.setParam("min_baseline", 0.02);
+  private_node.setParam("stream", true);
+  const StereoPipeline stereo(camera.node(), private_node);
+  Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+  ASSERT_TRUE(eventually([&] { return camera.listeners() > 0; }));
+  const ros::Time start = ros::Time::now();
+  const auto go = [&](int step, double x) {
+    const ros::Time stamp = start + ros::Duration(2.0 * step);
+    camera.rest(x, stamp);
+    camera.publish(toImage(test::roomFrom(x).image, "bgr8"), stamp);
+  };
+  std::vector<double> errors, shares;
+  const cv::Mat truth = test::roomFrom(0.0).range;
+  go(0, 0.0);
+  for (int step = 1; step <= 5; ++step) {
+    go(step, 0.05 * step);
+    ASSERT_TRUE(eventually([&] { return ranges.size() == static_cast<std::size_t>(step); }))
+        << step;
+    EXPECT_EQ(ranges.last()->header.stamp, start) << "the reference stays";
+    double share = 0.0;
+    errors.push_back(medianError(floats(*ranges.last()), truth, &share));
+    shares.push_back(share);
+  }
+  std::cout << "median errors with the travel:";
+  for (const double error : errors) std::cout << ' ' << error;
+  std::cout << '\n';
+  EXPECT_LT(errors.back(), 0.5 * errors.front());
+  EXPECT_GT(shares.back(), 0.95 * shares.front());
+
+  // Back where it began there is nothing to learn; too far away another reference is taken.
+  go(6, 0.001);
+  go(7, 0.31);
+  ASSERT_TRUE(eventually([&] { return ranges.size() == 6; }));
+  EXPECT_GT(ranges.last()->header.stamp, start);
+}
+
+TEST(Stereo, WhatWasKnownBeforeFillsWhatImagesConfirm) {
+  const auto lastOfTwo = [](const std::string& name, bool use_prior) {
+    Camera camera(name);
+    ros::NodeHandle private_node = parametersFor(camera, name);
+    private_node.setParam("use_prior", use_prior);
+    private_node.setParam("refine", true);
+    const StereoPipeline stereo(camera.node(), private_node);
+    Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+    const ros::Time stamp = ros::Time::now();
+    publishPair(camera, stamp - ros::Duration(6.0), stamp - ros::Duration(4.0));
+    EXPECT_TRUE(eventually([&] { return ranges.size() == 1; }));
+    // The camera goes on; the cloud of before moves along.
+    camera.rest(kBaseline + 0.11, stamp);
+    camera.publish(toImage(test::roomFrom(kBaseline + 0.11).image, "bgr8"), stamp);
+    EXPECT_TRUE(eventually([&] { return ranges.size() == 2; }));
+    double share = 0.0;
+    const double error =
+        medianError(floats(*ranges.last()), test::roomFrom(kBaseline + 0.11).range, &share);
+    return std::make_pair(share, error);
+  };
+  const auto [share, error] = lastOfTwo("with_prior", true);
+  const auto [share_alone, error_alone] = lastOfTwo("without_prior", false);
+  EXPECT_GT(share, share_alone);
+  EXPECT_LT(error, 1.1 * error_alone);
+}
+
+TEST(Stereo, SaysWhatIsWrongWithImagesThatGiveNothing) {
+  struct Case {
+    cv::Scalar grey;
+    const char* words;
+  };
+  int number = 0;
+  for (const Case& c :
+       {Case{cv::Scalar::all(0), "is black"}, Case{cv::Scalar::all(255), "saturated"},
+        Case{cv::Scalar::all(90), "has no contrast"}}) {
+    Camera camera("plain" + std::to_string(number++));
+    const StereoPipeline stereo(camera.node(), parametersFor(camera, camera.base()));
+    Collector<sensor_msgs::Image> ranges(camera.node(), "range");
+    Collector<diagnostic_msgs::DiagnosticArray> diagnostics(camera.node(), "/diagnostics");
+    ASSERT_TRUE(eventually([&] { return camera.listeners() > 0; }));
+    const auto isTold = [&] {
+      for (const auto& message : diagnostics.messages())
+        for (const auto& status : message->status)
+          if (status.message.find(c.words) != std::string::npos) return true;
+      return false;
+    };
+    const cv::Mat plain(views().right.size(), CV_8UC3, c.grey);
+    ros::Time stamp = ros::Time::now();
+    // It is told for a while after each cloud.
+    EXPECT_TRUE(eventually(
+        [&] {
+          for (const double x : {0.0, kBaseline}) {
+            stamp += ros::Duration(2.0);
+            camera.rest(x, stamp);
+            camera.publish(toImage(plain, "bgr8"), stamp);
+          }
+          return eventually(isTold, 3.0);
+        },
+        60.0))
+        << c.words;
+    ASSERT_GT(ranges.size(), 0u) << "an honest empty cloud";
+    EXPECT_EQ(cv::countNonZero(floats(*ranges.last()) > 0), 0);
+  }
+}
+
 TEST(Stereo, ShowsEpipolarCurvesOfTheClickedPixels) {
   Camera camera("clicked");
   const StereoPipeline stereo(camera.node(), parametersFor(camera, "clicked"));
@@ -528,6 +720,11 @@ TEST(Stereo, RefusesParametersByName) {
   EXPECT_THAT(refusal("matcher", "magic"), HasSubstr("matcher"));
   EXPECT_THAT(refusal("mask", "/none.png"), HasSubstr("/none.png"));
   EXPECT_THAT(refusal("lens", "/none.yaml"), HasSubstr("/none.yaml"));
+  EXPECT_THAT(refusal("hypotheses", "99999"), HasSubstr("hypotheses"));
+  EXPECT_THAT(refusal("cost", "sad"), HasSubstr("cost"));
+  EXPECT_THAT(refusal("window", "round"), HasSubstr("window"));
+  EXPECT_THAT(refusal("roi", "1,2,3"), HasSubstr("roi"));
+  EXPECT_THAT(refusal("reduce", "0"), HasSubstr("reduce"));
 }
 
 TEST(StereoMessages, CloudsComeBackAsTheyWent) {
@@ -543,6 +740,31 @@ TEST(StereoMessages, CloudsComeBackAsTheyWent) {
   EXPECT_EQ(cv::norm(back.bgr, cloud.bgr, cv::NORM_INF), 0.0);
   EXPECT_EQ(cv::norm(back.sigma, cloud.sigma, cv::NORM_INF), 0.0);
   EXPECT_EQ(cv::norm(back.score, cloud.score, cv::NORM_INF), 0.0);
+  // Filled right from a match it is the same, and so is one that was filled before.
+  MatchResult match;
+  match.range = cloud.sigma * 3.0;
+  match.range.at<float>(1, 2) = std::numeric_limits<float>::quiet_NaN();
+  match.sigma = cloud.sigma;
+  match.score = cloud.score;
+  cv::Mat grey;
+  cv::cvtColor(cloud.bgr, grey, cv::COLOR_BGR2GRAY);
+  sensor_msgs::PointCloud2 filled = *message;
+  for (const cv::Mat& picture : {cloud.bgr, grey}) {
+    fillPointCloud(match, cloud.xyz, picture, {}, 2, &filled);
+    const sensor_msgs::PointCloud2Ptr whole =
+        toPointCloud(makeCloud(match, cloud.xyz, picture), {});
+    EXPECT_EQ(filled.fields, whole->fields);
+    const Cloud a = fromPointCloud(filled), b = fromPointCloud(*whole);
+    for (int v = 0; v < 3; ++v) {
+      for (int u = 0; u < 5; ++u) {
+        const cv::Vec3f p = a.xyz.at<cv::Vec3f>(v, u), q = b.xyz.at<cv::Vec3f>(v, u);
+        EXPECT_TRUE(p == q || (std::isnan(p[0]) && std::isnan(q[0]))) << u << " " << v;
+      }
+    }
+    EXPECT_EQ(cv::norm(a.bgr, b.bgr, cv::NORM_INF), 0.0);
+    EXPECT_TRUE(std::isnan(a.xyz.at<cv::Vec3f>(1, 2)[0]));
+  }
+  EXPECT_THROW(fillPointCloud(match, cloud.xyz, cv::Mat(2, 2, CV_8UC1), {}, 1, &filled), Error);
   sensor_msgs::PointCloud2 spoiled = *message;
   spoiled.data.pop_back();
   EXPECT_THROW(fromPointCloud(spoiled), InputError);

@@ -12,6 +12,7 @@
 #include <message_filters/synchronizer.h>
 #include <omnister/StereoConfig.h>
 #include <ros/ros.h>
+#include <sensor_msgs/PointCloud2.h>
 #include <tf2_ros/buffer.h>
 #include <tf2_ros/transform_listener.h>
 
@@ -49,7 +50,13 @@ struct StereoParameters {
   double min_period = 0.0;  ///< between the beginnings of two matches [s]; of `max_rate`
   MatcherOptions matching;  ///< with the mask
   std::string matcher = "sweep";
-  std::string preset = "custom";  ///< of positions, hypotheses and matcher, see cfg/Stereo.cfg
+  std::string preset = "custom";   ///< of positions, hypotheses and matcher, see cfg/Stereo.cfg
+  std::string cost = "census";     ///< see parseMatchCost()
+  std::string window = "surface";  ///< see parseMatchWindow()
+  std::string mask;                ///< image file; empty: none
+  std::string region;              ///< `roi`, see parseRegion()
+  int reduce = 1;
+  bool use_prior = false, stream = false;  ///< see WorkerSettings
   DriftParameters drift;
   std::string epipolar_pixels;  ///< of the overlay, see parsePixels(); empty: defaultPixels()
 };
@@ -101,8 +108,8 @@ class StereoPipeline {
   void pollPairing();              ///< mutex_ is held
   void putPending(StereoSet job);  ///< mutex_ is held
   void process(const StereoSet& job);
-  void publishOverlay(const StereoSet& job, const PreparedSet& prepared,
-                      const StereoParameters& live, const MatchResult& result);
+  void publishOverlay(const MatchedSet& matched, const StereoParameters& live);
+  sensor_msgs::PointCloud2Ptr cloudMessage();
   PoseAnswer cameraPose(const std::string& frame_id, std::int64_t stamp_ns);
   /// Empties the tf buffer where it is filled from the future. @return true if it was
   bool forgetFuture(const std::string& frame_id);
@@ -160,9 +167,12 @@ class StereoPipeline {
   ros::SteadyTime last_image_;   ///< of the reference camera; zero: none yet
   double image_interval_ = 0.0;  ///< between the last two [s]
   MatchStatistics last_statistics_;
+  int last_positions_ = 0;   ///< displaced images of the last cloud
+  std::string last_remark_;  ///< what is wrong with its images, where it is next to nothing
 
   StereoWorker worker_;                ///< used by thread_ only
   std::size_t worker_generation_ = 0;  ///< of live_ that worker_ was set up with
+  std::vector<sensor_msgs::PointCloud2Ptr> cloud_messages_;  ///< likewise
   std::thread thread_;
 
   DriftDiagnostic drift_;

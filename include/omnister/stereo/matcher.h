@@ -9,6 +9,7 @@
 #include <memory>
 #include <opencv2/core/mat.hpp>
 #include <string>
+#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -36,11 +37,33 @@ struct StereoGeometry {
   Eigen::MatrixXd reference_covariance = {};
 };
 
+/// How windows are compared.
+enum class MatchCost {
+  kCensus,  ///< signs of differences with 24 neighbours, Hamming distances (Zabih and Woodfill 1994)
+  kZncc,    ///< correlation of grey values without their means; exposures may differ
+  kThesis,  ///< correlation of grey values as they are (Johnson 1997, eq. 3.1)
+};
+/// "census", "zncc" or "eq3.1". @throws Error for another name
+MatchCost parseMatchCost(std::string_view name);
+
+/// How windows stand in space.
+enum class MatchWindow {
+  kSurface,  ///< as the surfaces that coarser images show, plane by plane; else along the circle of
+             ///< one parallax angle
+  kRay,      ///< normal to the ray of their middle
+  kFronto,   ///< parallel to the image plane, as in the thesis; normal to the ray beyond 80 degrees
+  kBest,     ///< the better of the two, pixel by pixel
+};
+/// "surface", "ray", "fronto" or "best". @throws Error for another name
+MatchWindow parseMatchWindow(std::string_view name);
+
 struct MatcherOptions {
   double min_range = 0.0;           ///< along the ray [m]; 0: a parallax of atan(1/4) at most
   double max_range = 0.0;           ///< along the ray [m]; 0: infinity
   int hypotheses = 0;               ///< most candidates a pixel; 0: one for every pixel of parallax
   int threads = 0;                  ///< 0: every core
+  MatchCost cost = MatchCost::kCensus;  ///< sweep only; the thesis' matcher has eq. 3.1
+  MatchWindow window = MatchWindow::kSurface;  ///< sweep only
   /// Grey values have the last word on a pair's ranges too: half the error for a few times the time.
   /// With several displaced images they always have. Sweep only.
   bool refine = false;
@@ -74,6 +97,11 @@ class Matcher {
   /// @param displaced CV_8UC1, one for each of StereoGeometry::displaced
   /// @throws Error for images of another size or type
   virtual MatchResult match(const cv::Mat& reference, const std::vector<cv::Mat>& displaced) = 0;
+
+  /// Another MatcherOptions::prior from now on; may be empty. @return false for a matcher that was
+  /// made to take none: the sweep takes one where it refines, and a prior or several displaced
+  /// images make it. @throws Error for a prior of another size or type
+  virtual bool setPrior(const cv::Mat& prior);
 };
 
 /// @param name "sweep" or "thesis"

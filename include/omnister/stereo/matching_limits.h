@@ -32,6 +32,9 @@ constexpr int kMaxThreads = 1024;
 /// @throws Error with one line that says what is wrong
 MatchingLimits checkMatching(const StereoGeometry& geometry, const MatcherOptions& options);
 
+/// @throws Error unless a prior range is empty or an image of floats of the reference size
+void checkPrior(const StereoGeometry& geometry, const cv::Mat& prior);
+
 /// To be called before a large allocation.
 /// @param what e.g. "the cost volume"
 /// @throws Error when it is more than half of the machine's memory

@@ -92,7 +92,7 @@ TEST_P(CarFisheye, PavementIsAPlaneAtTheHeightOfTheCamera) {
 }
 
 // What a stage is for: more positions of the one camera, all matched at once.
-TEST_P(CarFisheye, FivePositionsTightenThePavement) {
+TEST_P(CarFisheye, MorePositionsTightenThePavement) {
   if (!test::fs::exists(test::dataFolder("planesweep_car_fisheye"))) {
     GTEST_SKIP() << "no ../shared/data/planesweep_car_fisheye";
   }
@@ -114,12 +114,17 @@ TEST_P(CarFisheye, FivePositionsTightenThePavement) {
     const MatchResult match = makeMatcher("sweep", geometry, options)->match(reference, displaced);
     const PlaneFit fit = fitPlane(makeCloud(match, *car.lens.lens, reference).xyz(pavement));
     std::cout << GetParam().side << ", " << others.size() + 1 << " frames: height " << fit.distance
-              << " m, median range error " << 100.0 * fit.all.median_range_error << " %, "
-              << fit.all.points << " of " << pavement.area() << '\n';
+              << " m, rms " << fit.all.rms << " m, median range error "
+              << 100.0 * fit.all.median_range_error << " %, " << fit.all.points << " of "
+              << pavement.area() << '\n';
     return fit;
   };
   const PlaneFit two = measure({middle + 1});
+  const PlaneFit three = measure({middle - 1, middle + 1});
   const PlaneFit five = measure({middle - 2, middle - 1, middle + 1, middle + 2});
+  EXPECT_LT(three.all.median_range_error, two.all.median_range_error);
+  for (const PlaneFit& fit : {two, three, five})
+    EXPECT_NEAR(fit.distance, GetParam().height, GetParam().tolerance);
   EXPECT_LT(five.all.median_range_error, 0.9 * two.all.median_range_error);
   EXPECT_GT(five.all.points, 0.99 * two.all.points);
 }

@@ -160,6 +160,22 @@ class SmallPair : public testing::Test {
         ->match(pair_.reference.image, {pair_.displaced});
   }
 
+  /// Median and 90 % quantile of errors over sigma; of a normal distribution 0.67 and 1.64.
+  std::pair<double, double> errorsInSigmas(const MatchResult& result) const {
+    std::vector<double> ratios;
+    for (int y = 0; y < size_.height; ++y) {
+      for (int x = 0; x < size_.width; ++x) {
+        const double truth = pair_.reference.range.at<double>(y, x);
+        const double range = result.range.at<float>(y, x);
+        if (std::isnan(truth) || std::isnan(range)) continue;
+        ratios.push_back(std::abs(range - truth) / result.sigma.at<float>(y, x));
+      }
+    }
+    EXPECT_GT(ratios.size(), 20000u);
+    std::sort(ratios.begin(), ratios.end());
+    return {ratios[ratios.size() / 2], ratios[ratios.size() * 9 / 10]};
+  }
+
   const cv::Size size_{246, 203};
   const Pair& pair_ = rendered();
 };
@@ -241,21 +257,118 @@ TEST_F(SmallPair, RespectsMaskAndRangeLimits) {
 
 TEST_F(SmallPair, SigmaTellsTheError) {
   const MatchResult result = match();
-  std::vector<double> ratios;
-  for (int y = 0; y < size_.height; ++y) {
-    for (int x = 0; x < size_.width; ++x) {
-      const double truth = pair_.reference.range.at<double>(y, x);
-      const double range = result.range.at<float>(y, x);
-      if (std::isnan(truth) || std::isnan(range)) continue;
-      ratios.push_back(std::abs(range - truth) / result.sigma.at<float>(y, x));
-    }
+  const auto [median, most] = errorsInSigmas(result);
+  EXPECT_GT(median, 0.25);
+  EXPECT_LT(median, 1.3);
+  EXPECT_LT(most, 4.0);
+}
+
+class EveryCost : public SmallPair, public testing::WithParamInterface<const char*> {
+ protected:
+  MatcherOptions options() const {
+    MatcherOptions options;
+    options.cost = parseMatchCost(GetParam());
+    return options;
   }
-  ASSERT_GT(ratios.size(), 20000u);
-  std::sort(ratios.begin(), ratios.end());
-  // Of a normal distribution the median is 0.67 and 95 % lie under 2.
-  EXPECT_GT(ratios[ratios.size() / 2], 0.25);
-  EXPECT_LT(ratios[ratios.size() / 2], 1.3);
-  EXPECT_LT(ratios[ratios.size() * 9 / 10], 4.0);
+};
+
+TEST_P(EveryCost, FindsTheWallsAndKnowsItsErrors) {
+  const MatchResult result = match(options());
+  Quality quality = judge(pair_, result);
+  EXPECT_GT(quality.density(), 0.93);
+  EXPECT_LT(quality.quantile(0.5), 0.12);
+  EXPECT_LT(quality.quantile(0.95), 0.7);
+  const auto [median, most] = errorsInSigmas(result);
+  EXPECT_GT(median, 0.25);
+  EXPECT_LT(median, 1.3);
+  EXPECT_LT(most, 4.0);
+}
+
+TEST_P(EveryCost, IsTheSameOnEveryInstructionSetAndForAnyNumberOfThreads) {
+  MatcherOptions few = options();
+  few.threads = 1;
+  const MatchResult best = match(few);
+  ASSERT_GT(best.statistics.valid, 20000u);
+  few.threads = 3;
+  EXPECT_TRUE(same(best, match(few)));
+  for (const char* name : {"avx2", "sse4", "scalar"}) {
+    sweep::holdSimd(name);
+    EXPECT_TRUE(same(best, match(options()))) << name << " is " << sweep::simdName();
+  }
+}
+
+TEST_P(EveryCost, OfUnrelatedImagesGivesLittle) {
+  const cv::Mat other =
+      test::look(test::room(1.5, 0.1, 77), *pair_.geometry.reference_lens, size_, Pose::Identity())
+          .image;
+  const MatchResult result =
+      makeSweepMatcher(pair_.geometry, options())->match(pair_.reference.image, {other});
+  EXPECT_LT(result.statistics.valid, 0.05 * size_.area());
+}
+
+INSTANTIATE_TEST_SUITE_P(Sweep, EveryCost, testing::Values("census", "zncc", "eq3.1"));
+
+TEST_F(SmallPair, OnlyCensusAndZnccTakeAnotherExposure) {
+  cv::Mat darker;
+  pair_.displaced.convertTo(darker, CV_8UC1, 0.55, 60);
+  const auto found = [&](const char* cost) {
+    MatcherOptions options;
+    options.cost = parseMatchCost(cost);
+    return judge(pair_,
+                 makeSweepMatcher(pair_.geometry, options)->match(pair_.reference.image, {darker}))
+        .density();
+  };
+  EXPECT_GT(found("census"), 0.9);
+  EXPECT_GT(found("zncc"), 0.9);
+  EXPECT_LT(found("eq3.1"), found("zncc"));
+  EXPECT_THROW(parseMatchCost("ncc"), Error);
+}
+
+TEST_F(SmallPair, WindowsMayStandAnyWay) {
+  for (const char* window : {"ray", "fronto", "best"}) {
+    MatcherOptions options;
+    options.window = parseMatchWindow(window);
+    options.threads = 1;
+    const MatchResult result = match(options);
+    Quality quality = judge(pair_, result);
+    EXPECT_GT(quality.density(), 0.93) << window;
+    EXPECT_LT(quality.quantile(0.5), 0.12) << window;
+    EXPECT_LT(quality.quantile(0.95), 0.8) << window;
+    options.threads = 3;
+    EXPECT_TRUE(same(result, match(options))) << window;
+  }
+  EXPECT_THROW(parseMatchWindow("slanted"), Error);
+}
+
+// A wall parallel to the image plane: windows that stand as it does see it without a bend.
+TEST(Sweep, WindowsThatStandAsTheSurfaceDoesCostLess) {
+  const cv::Size size(260, 230);
+  const LensPtr lens = lensOf("conic", size, 150);
+  const Pair pair = makePair(test::wall(1.2, 0.05), lens, size, test::pose(0.28, 0, 0));
+  const auto score = [&](MatchWindow window) {
+    MatcherOptions options;
+    options.window = window;
+    const MatchResult result =
+        makeSweepMatcher(pair.geometry, options)->match(pair.reference.image, {pair.displaced});
+    EXPECT_GT(result.statistics.valid, 15000u);
+    double sum = 0;
+    int count = 0;
+    for (int y = 0; y < size.height; ++y) {
+      for (int x = 0; x < size.width; ++x) {
+        const float s = result.score.at<float>(y, x);
+        const auto ray = lens->unproject(Eigen::Vector2d(x, y));
+        // Where wall and ray-normal windows differ most.
+        if (std::isnan(s) || !ray || ray->z() > std::cos(45 * kDegree)) continue;
+        sum += s;
+        ++count;
+      }
+    }
+    EXPECT_GT(count, 3000);
+    return sum / count;
+  };
+  const double ray = score(MatchWindow::kRay), fronto = score(MatchWindow::kFronto);
+  EXPECT_GT(fronto, ray + 0.01);
+  EXPECT_GT(score(MatchWindow::kBest), ray + 0.01);
 }
 
 TEST_F(SmallPair, ExposureDoesNotMatter) {
@@ -311,6 +424,24 @@ TEST(Sweep, TinyImagesAreNoTrouble) {
     const MatchResult result = matcher->match(image, {image});
     EXPECT_EQ(result.range.size(), size);
     EXPECT_EQ(result.statistics.valid, 0u);
+  }
+}
+
+TEST(Sweep, WhatNoMachineHoldsIsRefusedBeforeItIsAllocated) {
+  StereoGeometry geometry;
+  geometry.reference_size = cv::Size(32766, 32766);
+  geometry.reference_lens = lensOf("conic", geometry.reference_size, 170);
+  for (int i = 1; i <= 16; ++i) {
+    geometry.displaced.push_back(
+        {geometry.reference_lens, geometry.reference_size, test::pose(0.1 * i, 0, 0)});
+  }
+  try {
+    makeSweepMatcher(geometry, {});
+    FAIL() << "taken";
+  } catch (const Error& error) {
+    EXPECT_NE(std::string(error.what()).find("more than half of this machine's memory"),
+              std::string::npos)
+        << error.what();
   }
 }
 

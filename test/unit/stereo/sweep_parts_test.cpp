@@ -11,6 +11,7 @@
 
 #include "omnister/common/error.h"
 #include "omnister/lens/lens_models.h"
+#include "stereo/sweep_cost.h"
 #include "stereo/sweep_filters.h"
 #include "stereo/sweep_geometry.h"
 #include "stereo/sweep_kernels.h"
@@ -421,6 +422,91 @@ TEST_P(EverySet, MatchingFindsTheLeastBoxOfBits) {
       ASSERT_EQ(before[i], box(best - 1));
       ASSERT_EQ(after[i], box(best + 1));
     }
+  }
+}
+
+TEST_P(EverySet, CorrelationsAreThoseOfTheirFormulas) {
+  constexpr int kWidth = 23, kHeight = 19, kStride = 32, kCells = 4096;
+  std::mt19937 random(11);
+  std::vector<std::uint8_t> reference(kStride * kHeight + 64), cells(kCells + 256);
+  for (int y = 0; y < kHeight; ++y)
+    for (int x = 0; x < kWidth; ++x)
+      reference[y * kStride + x] = static_cast<std::uint8_t>(100 + random() % 60);
+  for (auto& cell : cells) cell = static_cast<std::uint8_t>(80 + random() % 90);
+  std::vector<std::int32_t> base(kStride * kHeight, 0);
+  for (auto& b : base) b = static_cast<std::int32_t>(64 + random() % (kCells - 200));
+  // Windows without contrast, here and there.
+  for (int y = 0; y < 8; ++y) std::fill_n(&reference[y * kStride], 9, std::uint8_t{77});
+  constexpr int kInner = (kWidth - 2 * kRadius) * (kHeight - 2 * kRadius);
+  std::vector<std::uint16_t> cost(kInner, 0xFFFF), before(kInner), after(kInner);
+  std::vector<std::int16_t> index(kInner);
+  std::vector<std::uint8_t> scratch;
+  ChunkJob job;
+  job.width = kWidth;
+  job.height = kHeight;
+  job.stride = kStride;
+  job.base = base.data();
+  job.reference[0] = reference.data();
+  job.cells[0] = cells.data();
+  job.cost = cost.data();
+  job.index = index.data();
+  job.before = before.data();
+  job.after = after.data();
+  job.scratch = &scratch;
+  for (const bool without_mean : {true, false}) {
+    job.fresh = true;
+    for (const auto& [first, lanes] : {std::pair(-9, 16), std::pair(5, 32)}) {
+      job.first = first;
+      job.lanes = lanes;
+      correlateChunk(job, without_mean);
+      job.fresh = false;
+    }
+    int plain = 0;
+    for (int y = 0; y < kHeight - 2 * kRadius; ++y) {
+      for (int x = 0; x < kWidth - 2 * kRadius; ++x) {
+        double a = 0, aa = 0;
+        for (int v = y; v < y + kWindow; ++v) {
+          for (int u = x; u < x + kWindow; ++u) {
+            a += reference[v * kStride + u];
+            aa += std::pow(reference[v * kStride + u], 2);
+          }
+        }
+        constexpr double kCount = kWindow * kWindow;
+        const double variance = aa / kCount - a * a / kCount / kCount;
+        const auto costOf = [&](int k) {
+          double b = 0, bb = 0, ab = 0;
+          for (int v = y; v < y + kWindow; ++v) {
+            for (int u = x; u < x + kWindow; ++u) {
+              const double grey = cells[base[v * kStride + u] + k];
+              b += grey;
+              bb += grey * grey;
+              ab += grey * reference[v * kStride + u];
+            }
+          }
+          // Half of all bits for windows without relation, in sixteenths.
+          const double unrelated = 0.5 * kCount * kBits * 16;
+          if (variance < kLeastVariance) return 32767.0;
+          const double zncc =
+              (kCount * ab - a * b) / std::sqrt((kCount * aa - a * a) * (kCount * bb - b * b));
+          const double eq31 = ab / std::sqrt(aa * bb);
+          return without_mean ? unrelated * (1 - zncc)
+                              : unrelated * (1 - eq31) * (aa / kCount) / variance;
+        };
+        const int i = y * (kWidth - 2 * kRadius) + x;
+        plain += variance < kLeastVariance;
+        if (variance < kLeastVariance) {
+          ASSERT_EQ(cost[i], 32767);
+          continue;
+        }
+        double best = costOf(-8);
+        for (int k = -8; k <= 35; ++k) best = std::min(best, costOf(k));
+        ASSERT_NEAR(cost[i], std::min(best, 32767.0), 2) << x << " " << y;
+        ASSERT_NEAR(cost[i], std::min(costOf(index[i]), 32767.0), 2);
+        ASSERT_NEAR(before[i], std::min(costOf(index[i] - 1), 32767.0), 2);
+        ASSERT_NEAR(after[i], std::min(costOf(index[i] + 1), 32767.0), 2);
+      }
+    }
+    EXPECT_GT(plain, 0);
   }
 }
 

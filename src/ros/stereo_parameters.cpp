@@ -1,0 +1,142 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "stereo_parameters.h"
+
+#include "omnister/common/error.h"
+#include "omnister/common/image_file.h"
+#include "omnister/stereo/input_region.h"
+#include "omnister/view/epipolar_overlay.h"
+
+namespace omnister {
+namespace {
+
+/// Frames that may be needed to find `positions` places.
+std::size_t historyFor(int positions) { return static_cast<std::size_t>(positions) + 7; }
+
+}  // namespace
+
+cv::Mat loadMask(const std::string& path) {
+  if (path.empty()) return {};
+  return readImage(path, ImageColor::kGray);
+}
+
+void applyPreset(StereoConfig& config) {
+  if (config.preset == "custom") return;
+  config.matcher = "sweep";
+  config.positions = config.preset == "accurate" ? 4 : 1;
+  config.hypotheses = 0;
+}
+
+StereoConfig toConfig(const StereoParameters& parameters) {
+  StereoConfig config = StereoConfig::__getDefault__();
+  config.preset = parameters.preset;
+  config.min_baseline = parameters.pairing.min_baseline;
+  config.max_baseline = parameters.pairing.max_baseline;
+  config.positions = parameters.pairing.positions;
+  config.min_range = parameters.matching.min_range;
+  config.max_range = parameters.matching.max_range;
+  config.hypotheses = parameters.matching.hypotheses;
+  config.matcher = parameters.matcher;
+  config.cost = parameters.cost;
+  config.window = parameters.window;
+  config.refine = parameters.matching.refine;
+  config.mask = parameters.mask;
+  config.roi = parameters.region;
+  config.reduce = parameters.reduce;
+  config.use_prior = parameters.use_prior;
+  config.stream = parameters.stream;
+  config.max_rate = parameters.min_period > 0.0 ? 1.0 / parameters.min_period : 0.0;
+  config.epipolar_pixels = parameters.epipolar_pixels;
+  return config;
+}
+
+void take(const StereoConfig& config, StereoParameters& parameters) {
+  parameters.preset = config.preset;
+  parameters.pairing.min_baseline = config.min_baseline;
+  parameters.pairing.max_baseline = config.max_baseline;
+  parameters.pairing.positions = config.positions;
+  parameters.pairing.history = historyFor(config.positions);
+  parameters.matching.min_range = config.min_range;
+  parameters.matching.max_range = config.max_range;
+  parameters.matching.hypotheses = config.hypotheses;
+  parameters.matcher = config.matcher;
+  parameters.cost = config.cost;
+  parameters.window = config.window;
+  parameters.matching.cost = parseMatchCost(config.cost);
+  parameters.matching.window = parseMatchWindow(config.window);
+  parameters.matching.refine = config.refine;
+  parameters.mask = config.mask;
+  parameters.region = config.roi;
+  parameters.reduce = config.reduce;
+  parameters.use_prior = config.use_prior;
+  parameters.stream = config.stream;
+  parameters.min_period = config.max_rate > 0.0 ? 1.0 / config.max_rate : 0.0;
+  parameters.epipolar_pixels = config.epipolar_pixels;
+}
+
+WorkerSettings settingsOf(const StereoParameters& parameters) {
+  WorkerSettings settings;
+  settings.matcher = parameters.matcher;
+  settings.matching = parameters.matching;
+  settings.region = parameters.region;
+  settings.reduce = parameters.reduce;
+  settings.use_prior = parameters.use_prior;
+  settings.stream = parameters.stream;
+  settings.min_baseline = parameters.pairing.min_baseline;
+  settings.max_baseline = parameters.pairing.max_baseline;
+  settings.max_rotation = parameters.pairing.max_rotation;
+  return settings;
+}
+
+StereoParameters loadStereoParameters(Parameters& parameters) {
+  StereoParameters result;
+  result.rig = parameters.choice("mode", "stage", {"stage", "rig"}) == "rig";
+  result.lens = parameters.text("lens", "");
+  result.lens_displaced = parameters.text("lens_displaced", "");
+  result.rig_file = parameters.text("rig", "");
+  result.fixed_frame = parameters.frame("fixed_frame", result.fixed_frame);
+  result.mask = parameters.text("mask", "");
+  result.matching.mask = loadMask(result.mask);
+
+  PairingOptions& pairing = result.pairing;
+  pairing.min_baseline = parameters.number("min_baseline", 0.01, 1e-6, 1e3, "m");
+  pairing.max_baseline = parameters.number("max_baseline", 1.0, 1e-6, 1e3, "m");
+  pairing.max_rotation = parameters.number("max_rotation", 0.5, 0.0, 3.2, "rad");
+  pairing.positions = parameters.integer("positions", 1, 1, 16);
+  pairing.settle_time = parameters.number("settle_time", 0.04, 0.0, 10.0, "s");
+  pairing.settle_distance = parameters.number("settle_distance", 2e-4, 0.0, 1.0, "m");
+  pairing.max_wait = parameters.number("max_wait", 1.0, 0.0, 60.0, "s");
+  pairing.max_age = parameters.number("max_age", 0.0, 0.0, 1e6, "s");
+
+  result.max_skew = parameters.number("max_skew", 0.02, 0.0, 1.0, "s");
+  // rviz and others fail on huge coordinates, so a cloud always ends somewhere.
+  result.matching.min_range = parameters.number("min_range", 0.0, 0.0, 1e4, "m");
+  result.matching.max_range = parameters.number("max_range", 50.0, 1e-3, 1e4, "m");
+  result.matching.hypotheses = parameters.integer("hypotheses", 0, 0, 4096);
+  result.matching.threads = parameters.integer("threads", 0, 0, 256);
+  result.matching.refine = parameters.flag("refine", false);
+  result.cost = parameters.choice("cost", "census", {"census", "zncc", "eq3.1"});
+  result.window = parameters.choice("window", "surface", {"surface", "ray", "fronto", "best"});
+  result.region = parameters.text("roi", "");
+  parseRegion(result.region, kAnySize, "~roi");
+  result.reduce = parameters.integer("reduce", 1, 1, 16);
+  result.use_prior = parameters.flag("use_prior", false);
+  result.stream = parameters.flag("stream", false);
+  if (result.stream && result.rig)
+    throw InputError("~stream", "", "is for one camera that moves, not for mode rig");
+  const double rate = parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)");
+  result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
+  result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
+  result.preset = parameters.choice("preset", "custom", {"custom", "balanced", "accurate"});
+  result.drift = loadDriftParameters(parameters);
+  result.epipolar_pixels = parameters.text("epipolar_pixels", "");
+  parsePixels(result.epipolar_pixels, "~epipolar_pixels");
+  StereoConfig config = toConfig(result);
+  applyPreset(config);
+  take(config, result);
+  if (result.matching.max_range <= result.matching.min_range)
+    throw InputError("~max_range", "", "is not larger than ~min_range");
+  parameters.warnUnknown();
+  return result;
+}
+
+}  // namespace omnister
