@@ -4,12 +4,14 @@ set -euo pipefail
 
 usage() {
   cat <<'TXT'
-./run bench [--quick] [--out DIR] [parts | compare | accuracy | scaling | node | camera | calibration [OPTION…]]
+./run bench [--quick] [--out DIR]
+    [parts | compare | accuracy | presets | scaling | node | camera | calibration [OPTION…]]
 
   parts      Google Benchmark: lenses, renderer, views, the sweep
   compare    the sweep beside OpenCV's matchers on the same rendered pair, at 1280x960 and 3060x2036,
              one thread and all: times as ratios, memory, density, errors
   accuracy   errors of the sweep by field angle on further scenes; phase bias; more than two positions
+  presets    fast, balanced and accurate in turn: time, density, errors ([RUNS])
   scaling    cost by pixels, hypotheses, positions and threads, with a plot
   node       clouds a second of the stereo node at 1280x960, image messages to published clouds
   camera     processor time of the camera driver beside a bare Aravis loop, on Debian's software camera
@@ -79,6 +81,7 @@ case "$part" in
     parts
     compare
     stereo --suite accuracy
+    omnister_bench_presets
     stereo --suite scaling --runs "$([ -n "$quick" ] && echo 3 || echo 5)"
     node --clouds "$([ -n "$quick" ] && echo 30 || echo 100)"
     camera --rounds "$([ -n "$quick" ] && echo 1 || echo 5)"
@@ -86,6 +89,7 @@ case "$part" in
   parts) parts "$@" ;;
   compare) compare "$@" ;;
   accuracy) stereo --suite accuracy "$@" ;;
+  presets) omnister_bench_presets "$@" ;;
   scaling) stereo --suite scaling "$@" ;;
   camera) camera "$@" ;;
   calibration) calibration "$@" ;;

@@ -27,6 +27,7 @@
 #include "omnister/stereo/input_region.h"
 #include "omnister/stereo/matcher.h"
 #include "omnister/stereo/matching_limits.h"
+#include "omnister/stereo/presets.h"
 #include "omnister/stereo/thesis_matcher.h"
 
 namespace omnister::tools {
@@ -50,6 +51,7 @@ struct StereoArguments {
   std::string roi;
   std::vector<std::string> pose_sigmas;
   int reduce = 1;
+  std::string preset;
   std::string matcher = "sweep";
   std::string thesis_mask = "fig5.5";
   int thesis_window = 11;
@@ -298,6 +300,11 @@ void runStereo(StereoArguments& arguments, bool json) {
   checkFiles(arguments);
   cv::setNumThreads(threadCount(std::clamp(arguments.options.threads, 0, kMaxThreads)));
 
+  if (!arguments.preset.empty()) {
+    const MatchingPreset& preset = matchingPreset(arguments.preset);
+    arguments.reduce = preset.reduce;
+    arguments.options.refine = preset.refine;
+  }
   auto start = Clock::now();
   const char* for_the_sweep = arguments.options.refine                            ? "--refine"
                               : !arguments.prior.empty()                          ? "--prior"
@@ -469,7 +476,14 @@ void addStereo(CLI::App& app) {
       ->capture_default_str();
   command->add_option("--thesis-window", arguments->thesis_window, "Side of that mask, odd [px]")
       ->capture_default_str();
-  command->add_flag(
+  std::vector<std::string> presets;
+  for (const MatchingPreset& preset : matchingPresets()) presets.push_back(preset.name);
+  CLI::Option* preset =
+      command
+          ->add_option("--preset", arguments->preset,
+                       "fast: images of half the size; balanced: as they are; accurate: --refine")
+          ->check(CLI::IsMember(presets));
+  CLI::Option* refine = command->add_flag(
       "--refine", arguments->options.refine,
       "Let grey values have the last word on a pair's ranges: half the error for a few "
       "times the time; several displaced images always are refined");
@@ -491,10 +505,10 @@ void addStereo(CLI::App& app) {
           "Region of interest of the reference image, \"x,y,width,height\" [px]; what lies "
           "around it is left out")
       ->type_name("X,Y,W,H");
-  command
-      ->add_option("--reduce", arguments->reduce,
-                   "Reduce the images so many times, and the cloud with them")
-      ->capture_default_str();
+  CLI::Option* reduce = command
+                            ->add_option("--reduce", arguments->reduce,
+                                         "Reduce the images so many times, and the cloud with them")
+                            ->capture_default_str();
   command
       ->add_option("--prior", arguments->prior,
                    "Range image of the cloud's size, of a frame before: it stands where the images "
@@ -506,6 +520,7 @@ void addStereo(CLI::App& app) {
       ->add_option("--range", arguments->range,
                    "Range image to write: 32-bit float, along the ray [m], NaN where invalid")
       ->type_name("OUT.tiff");
+  preset->excludes(refine)->excludes(reduce);
   bool& json = addJsonFlag(*command);
   command->footer(
       "seconds.total is the matching and the points of one frame, images in memory; read, setup "

@@ -154,7 +154,7 @@ void surfaceFits(LensRun& run, Report& report) {
 void dewarpedDots(const LensRun& run, const std::vector<DewarpStatistics>& dewarped,
                   Report& report) {
   const Found& found = run.found;
-  for (int m = 0; m < 2; ++m) {
+  for (int m = 0; m < kFiguredModels; ++m) {
     if (!found.models[m].lens) continue;
     report.body += figure(dewarpPlot(dewarped[m]),
                           "Fig. 4.15: dewarped dots (red) and true places "

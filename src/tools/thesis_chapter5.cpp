@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
 #include "html_plot.h"
 #include "thesis_report.h"
 
@@ -8,21 +10,20 @@ namespace {
 /// Figs 5.6 to 5.8.
 void depthFigures(const Shape& shape, const Found& found,
                   const std::vector<DepthStatistics>& depths, int step, Report& report) {
-  const char* names[] = {"Fig. 5.6", "Fig. 5.7"};
-  for (int m = 0; m < 2; ++m) {
+  // The thesis shows the first two.
+  const char* maps[] = {"Fig. 5.6", "Fig. 5.7", "As fig. 5.7"};
+  const char* errors[] = {"Fig. 5.8a", "Fig. 5.8b", "As fig. 5.8"};
+  for (int m = 0; m < kFiguredModels; ++m) {
     if (depths[m].points.empty()) continue;
     const std::string name = escaped(found.models[m].name);
-    report.body += figure(depthMap(depths[m], shape.size, step),
-                          std::string(names[m]) + ": " + name +
-                              "; red is too far, blue too near, full colour 10 %; white: no match");
-    report.body += figure(depthProfile(depths[m]), std::string(names[m]) + " from below, " + name);
+    const std::string map = maps[std::min(m, 2)];
     report.body += figure(
-        axisErrorPlot(depths[m], shape.lens->center().y(), step),
-        std::string("Fig. 5.8") + (m == 0 ? "a" : "b") + ": depth error along the x axis, " + name);
-  }
-  if (depths.size() > 4 && !depths[4].points.empty()) {
+        depthMap(depths[m], shape.size, step),
+        map + ": " + name + "; red is too far, blue too near, full colour 10 %; white: no match");
+    report.body += figure(depthProfile(depths[m]), map + " from below, " + name);
     report.body +=
-        figure(axisErrorPlot(depths[4], shape.lens->center().y(), step), "The same by our asphere");
+        figure(axisErrorPlot(depths[m], shape.lens->center().y(), step),
+               std::string(errors[std::min(m, 2)]) + ": depth error along the x axis, " + name);
   }
 }
 

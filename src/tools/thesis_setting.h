@@ -50,6 +50,11 @@ struct Model {
   std::string why;  ///< then the reason
 };
 
+/// Of the models found, those that have figures of their own: all but the last, which is the first
+/// by another procedure.
+constexpr int kFiguredModels = 5;
+
+/// The lenses of one shape.
 struct Found {
   /// By straight lines, by the thesis' quadric, by our quadric, conic and asphere, by dots.
   std::vector<Model> models;

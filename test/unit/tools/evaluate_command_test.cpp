@@ -54,7 +54,9 @@ TEST_F(Evaluate, ThesisMakesOnePageAndItsFigures) {
   for (const char* named :
        {"Fig. 3.2", "Fig. 3.3", "Fig. 3.5", "Fig. 4.2", "Fig. 4.5", "Fig. 4.9", "Fig. 4.10",
         "Fig. 4.12", "Figs 4.11 and 4.13", "Fig. 4.14", "Fig. 4.15", "Fig. 5.1", "Fig. 5.3",
-        "Fig. 5.6", "Fig. 5.7", "Fig. 5.8", "Table 4.1", "Table 5.1", "fig. 5.4"}) {
+        "Fig. 5.6", "Fig. 5.7", "Fig. 5.8", "Table 4.1", "Table 5.1", "fig. 5.4",
+        "As fig. 5.7: quadric (our fit)", "As fig. 5.7: conic (our fit)",
+        "As fig. 5.7: asphere (our fit)"}) {
     EXPECT_THAT(page, HasSubstr(named));
   }
   EXPECT_THAT(page, Not(HasSubstr("src=\"http")));

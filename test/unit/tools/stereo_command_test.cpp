@@ -218,6 +218,24 @@ TEST_F(StereoCommand, RegionReductionAndPrior) {
     EXPECT_THAT(refusal(arguments(sweep, {"--reduce", reduce})), HasSubstr("reduce"));
 }
 
+TEST_F(StereoCommand, PresetsAreTheSettingsThatTheyStandFor) {
+  const auto range = [&](const std::vector<std::string>& added) {
+    const Outcome outcome = run(arguments({{"--matcher", ""}}, added));
+    EXPECT_EQ(outcome.code, 0) << outcome.err;
+    return readFile(path("range.tiff"));
+  };
+  EXPECT_EQ(range({"--preset", "fast"}), range({"--reduce", "2"}));
+  EXPECT_EQ(range({"--preset", "balanced"}), range({}));
+  const std::string accurate = range({"--preset", "accurate"});
+  EXPECT_EQ(accurate, range({"--refine"}));
+  EXPECT_NE(accurate, range({}));
+  for (const std::vector<std::string>& wrong : {std::vector<std::string>{"--preset", "best"},
+                                                {"--preset", "fast", "--reduce", "3"},
+                                                {"--preset", "balanced", "--refine"}}) {
+    EXPECT_EQ(run(arguments({{"--matcher", ""}}, wrong)).code, 2) << wrong.back();
+  }
+}
+
 TEST_F(StereoCommand, CalibrationsMakePartOfSigma) {
   const auto sigma = [&](const std::string& lens, const std::vector<std::string>& added) {
     const Outcome outcome = run(arguments({{"--matcher", ""}, {"--lens", path(lens)}}, added));
