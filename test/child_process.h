@@ -22,10 +22,14 @@ class ChildProcess {
     std::vector<char*> arguments;
     for (std::string& word : command) arguments.push_back(word.data());
     arguments.push_back(nullptr);
+    // Before the fork, so that whoever looks into it at once finds it.
+    const int printed = open(output.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0600);
     id_ = fork();
-    if (id_ != 0) return;
+    if (id_ != 0) {
+      close(printed);
+      return;
+    }
     prctl(PR_SET_PDEATHSIG, SIGKILL);
-    const int printed = open(output.c_str(), O_RDWR | O_CREAT, 0600);
     dup2(open("/dev/null", O_RDONLY), STDIN_FILENO);
     dup2(printed, STDOUT_FILENO);
     dup2(printed, STDERR_FILENO);
