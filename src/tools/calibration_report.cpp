@@ -210,6 +210,35 @@ std::string calibrationReport(const std::string& title, const Detections& detect
     }
     figure(plot.finish("angle off the axis [degrees]", "radius [px]"), "Lens profile along +x");
   }
+  {
+    // The surface stands over the pixels: each ray leaves through the point that lies at the height
+    // h = r cot(theta) over its pixel (Johnson 1997, ch. 4).
+    std::array<std::vector<Eigen::Vector2d>, 2> sections;
+    double least = 0.0;
+    double most = 0.0;
+    for (int axis = 0; axis < 2; ++axis) {
+      for (int i = -100; i <= 100; ++i) {
+        const double r = radius * (i + 0.5) / 100.0;
+        const auto ray = lens.unproject(center + r * Eigen::Vector2d::Unit(axis));
+        if (!ray) continue;
+        const double h = std::abs(r) * ray->z() / ray->head<2>().norm();
+        sections[axis].emplace_back(r, h);
+        least = std::min(least, h);
+        most = std::max(most, h);
+      }
+    }
+    Plot plot(520, 300, -radius, radius, 1.1 * least, 1.1 * most);
+    for (int axis = 0; axis < 2; ++axis) {
+      plot.color(axis == 0 ? 0.8 : 0.1, 0.2, axis == 0 ? 0.1 : 0.8);
+      for (std::size_t i = 1; i < sections[axis].size(); ++i) {
+        const Eigen::Vector2d& from = sections[axis][i - 1];
+        const Eigen::Vector2d& to = sections[axis][i];
+        plot.line(from.x(), from.y(), to.x(), to.y());
+      }
+    }
+    figure(plot.finish("pixels from the centre of distortion", "height [px]"),
+           "Lens surface, cut along x (red) and y (blue)");
+  }
 
   html += "<h2>Models tried</h2>\n<table>\n" +
           row({"structure", "RMS [px]", "held-out RMS [px]"}, "th");

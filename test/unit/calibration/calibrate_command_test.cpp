@@ -68,7 +68,10 @@ TEST_F(CalibrateCommand, WritesLensReportAndJson) {
   EXPECT_TRUE(file.covariance);
   const std::string html = readFile(folder_ / "report" / "report.html");
   EXPECT_THAT(html, HasSubstr("data:image/svg+xml;base64,PD94"));
-  EXPECT_THAT(html, HasSubstr("board7"));
+  for (const char* part :
+       {"Residual vectors", "against radius", "against azimuth", "radius and sector",
+        "Projection uncertainty", "Lens profile", "Lens surface", "board7"})
+    EXPECT_THAT(html, HasSubstr(part));
 }
 
 TEST_F(CalibrateCommand, TouchesNothingWhenItFails) {
