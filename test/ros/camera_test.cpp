@@ -211,7 +211,7 @@ TEST_F(CameraTest, SlowListenersStallNobody) {
   const std::string heard = (folder_.path() / "heard").string();
   // One in another process that stands still, and one in this process that never takes what waits
   // for it.
-  const test::ChildProcess stopped({"rostopic", "hz", topic}, heard);
+  const test::ChildProcess stopped({"env", "PYTHONUNBUFFERED=1", "rostopic", "hz", topic}, heard);
   ASSERT_TRUE(
       eventually([&] { return readFile(heard).find("average rate") != std::string::npos; }, 60.0));
   stopped.signal(SIGSTOP);
