@@ -6,7 +6,6 @@
 #include <cstdio>
 #include <fstream>
 #include <functional>
-#include <iostream>
 #include <nlohmann/json.hpp>
 #include <opencv2/calib3d.hpp>
 #include <opencv2/imgcodecs.hpp>
@@ -36,6 +35,8 @@ namespace {
 namespace fs = std::filesystem;
 using test::dataFolder;
 using test::kDegree;
+using test::wideLens;
+using test::wideScene;
 
 /// Rows of the table, printed as they come.
 class Figures {
@@ -172,19 +173,6 @@ void lenses(Figures& figures) {
               *std::max_element(splines.begin(), splines.end()), 0.05, "px", count);
   figures.add("  median", medianOf(splines), 0.01, "px");
   figures.add("published lenses as asphere r^6: median RMS", medianOf(aspheres), 0.05, "px");
-}
-
-LensPtr wideLens() {
-  return makeLens("asphere", {645.3, 473.1},
-                  {{"f", {285.0}}, {"alpha", {0.66}}, {"beta", {1.05}}, {"a4", {0.02}}},
-                  95 * kDegree, "truth");
-}
-
-test::BoardScene wideScene(unsigned seed, double noise_px) {
-  test::BoardScene scene;
-  scene.seed = seed;
-  scene.noise_px = noise_px;
-  return scene;
 }
 
 void simulation(Figures& figures, int seeds) {
@@ -327,52 +315,33 @@ void detection(Figures& figures) {
   figures.add("  processor time an image, average", cpu / images, 1.0, "s");
 }
 
+void timeCalibration(Figures& figures, const std::string& what, const Detections& detections,
+                     int folds, double limit) {
+  CalibrationOptions options;
+  options.folds = folds;
+  const Instant begin = Instant::now();
+  const CalibrationResult result = calibrate(detections, options);
+  const Instant end = Instant::now();
+  figures.add(what + ": processor time", end.cpu - begin.cpu, limit, "s",
+              "wall " + seconds(end.wall - begin.wall) + " s, " +
+                  result.file.calibration.notes.at("structure"));
+}
+
 void speed(Figures& figures) {
-  {
-    auto scene = wideScene(1, 0.1);
-    scene.views = 30;
-    scene.cols = 10;
-    scene.rows = 5;
-    const Detections detections = test::simulatedBoards(*wideLens(), scene);
-    const Instant begin = Instant::now();
-    CalibrationOptions options;
-    options.folds = 5;
-    calibrate(detections, options);
-    figures.add("30 boards of 50 corners, auto, 5 folds: processor time",
-                Instant::now().cpu - begin.cpu, 1.0, "s",
-                "wall " + seconds(Instant::now().wall - begin.wall) + " s");
-  }
+  auto scene = wideScene(1, 0.1);
+  scene.views = 30;
+  scene.cols = 10;
+  scene.rows = 5;
+  timeCalibration(figures, "30 boards of 50 corners, auto, 5 folds",
+                  test::simulatedBoards(*wideLens(), scene), 5, 1.0);
   const fs::path path = dataFolder("detections") / "opencv_jy_left.csv";
   if (fs::exists(path)) {
-    const Detections detections = readDetections(path, {1280, 800});
-    const Instant begin = Instant::now();
-    CalibrationOptions options;
-    options.folds = 5;
-    calibrate(detections, options);
-    figures.add("34 real boards of 48 corners, auto, 5 folds: processor time",
-                Instant::now().cpu - begin.cpu, 1.0, "s",
-                "wall " + seconds(Instant::now().wall - begin.wall) + " s");
+    timeCalibration(figures, "34 real boards of 48 corners, auto, 5 folds",
+                    readDetections(path, {1280, 800}), 5, 1.0);
   }
-  LensStructure structure;
-  structure.model = "spline";
-  structure.even_terms = 1;
-  structure.grid = 6;
-  const LensPtr plain = makeLens(structure, {645.3, 473.1}, 285.0, 95 * kDegree);
-  Eigen::VectorXd numbers = plain->parameters();
-  std::mt19937 random(3);
-  std::uniform_real_distribution<double> unit(-0.004, 0.004);
-  for (double& value : numbers.tail(72)) value = unit(random);
-  auto scene = wideScene(5, 0.1);
-  scene.views = 186;
-  scene.cols = scene.rows = 10;
-  scene.square = 0.02;
-  const Detections detections = test::simulatedBoards(*plain->withParameters(numbers), scene);
-  const Instant begin = Instant::now();
-  const CalibrationResult result = calibrate(detections, {});
-  figures.add("186 boards of 100 corners, auto, lens with a 2-D spline: processor time",
-              Instant::now().cpu - begin.cpu, 10.0, "s",
-              "wall " + seconds(Instant::now().wall - begin.wall) + " s, " +
-                  result.file.calibration.notes.at("structure"));
+  timeCalibration(figures, "186 boards of 100 corners, auto, lens with a 2-D spline",
+                  test::simulatedBoards(*test::bentLens(), test::bentScene(186)),
+                  CalibrationOptions().folds, 10.0);
 }
 
 int run(int argc, char** argv) {
@@ -408,10 +377,6 @@ int run(int argc, char** argv) {
 }  // namespace omnister::bench
 
 int main(int argc, char** argv) {
-  try {
-    return omnister::bench::run(argc, argv);
-  } catch (const std::exception& error) {
-    std::cerr << error.what() << "\n";
-    return 2;
-  }
+  return omnister::bench::report("omnister_bench_calibration",
+                                 [&] { return omnister::bench::run(argc, argv); });
 }

@@ -9,6 +9,7 @@
 #include <cstdio>
 #include <cstring>
 #include <ctime>
+#include <exception>
 #include <limits>
 #include <vector>
 
@@ -71,5 +72,16 @@ class PeakMemory {
   bool reset_ = false;
   double before_ = 0.0;
 };
+
+/// A benchmark's main: what goes wrong is one line and exit code 1.
+template <class Body>
+int report(const char* name, const Body& body) {
+  try {
+    return body();
+  } catch (const std::exception& error) {
+    std::fprintf(stderr, "%s: %s\n", name, error.what());
+    return 1;
+  }
+}
 
 }  // namespace omnister::bench

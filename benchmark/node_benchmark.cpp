@@ -9,7 +9,6 @@
 #include <atomic>
 #include <cstdio>
 #include <filesystem>
-#include <iostream>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -168,10 +167,6 @@ int run(int argc, char** argv) {
 }  // namespace omnister::bench
 
 int main(int argc, char** argv) {
-  try {
-    return omnister::bench::run(argc, argv);
-  } catch (const std::exception& error) {
-    std::cerr << error.what() << '\n';
-    return 1;
-  }
+  return omnister::bench::report("omnister_bench_node",
+                                 [&] { return omnister::bench::run(argc, argv); });
 }

@@ -87,11 +87,8 @@ int main(int argc, char** argv) {
     std::fprintf(stderr, "usage: omnister_bench_presets [RUNS]\n");
     return 2;
   }
-  try {
+  return omnister::bench::report("omnister_bench_presets", [&] {
     omnister::bench::run(runs);
-  } catch (const std::exception& error) {
-    std::fprintf(stderr, "omnister_bench_presets: %s\n", error.what());
-    return 1;
-  }
-  return 0;
+    return 0;
+  });
 }

@@ -7,7 +7,6 @@
 #include <cstdlib>
 #include <filesystem>
 #include <functional>
-#include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
 #include <opencv2/core.hpp>
@@ -622,10 +621,6 @@ int run(int argc, char** argv) {
 
 int main(int argc, char** argv) {
   cv::utils::logging::setLogLevel(cv::utils::logging::LOG_LEVEL_SILENT);
-  try {
-    return omnister::bench::run(argc, argv);
-  } catch (const std::exception& error) {
-    std::cerr << "omnister_bench_stereo: " << error.what() << '\n';
-    return 1;
-  }
+  return omnister::bench::report("omnister_bench_stereo",
+                                 [&] { return omnister::bench::run(argc, argv); });
 }

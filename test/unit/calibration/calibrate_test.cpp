@@ -14,6 +14,8 @@ namespace omnister {
 namespace {
 
 using test::BoardScene;
+using test::wideLens;
+using test::wideScene;
 using ::testing::HasSubstr;
 
 constexpr double kDegree = M_PI / 180.0;
@@ -21,22 +23,6 @@ constexpr double kDegree = M_PI / 180.0;
 bool fullTests() {
   const char* full = std::getenv("OMNISTER_FULL_TESTS");
   return full != nullptr && std::string(full) == "ON";
-}
-
-/// 190 degrees over 1280x960: r = 285 px at 90 degrees would be small; this one fills the height.
-LensPtr wideLens() {
-  const LensPtr lens = makeLens(
-      "asphere", {645.3, 473.1},
-      {{"f", {285.0}}, {"alpha", {0.66}}, {"beta", {1.05}}, {"a4", {0.02}}}, 95 * kDegree, "test");
-  return lens;
-}
-
-BoardScene wideScene(unsigned seed, double noise) {
-  BoardScene scene;
-  scene.seed = seed;
-  scene.noise_px = noise;
-  scene.views = 20;
-  return scene;
 }
 
 LensStructure sameStructure(const LensModel& lens) { return structureOf(lens); }
@@ -222,22 +208,9 @@ TEST(Calibrate, AutoChoosesByHeldOutErrorAndSaysSo) {
 }
 
 TEST(Calibrate, AGridSaysWhatNoRadialSurfaceCan) {
-  LensStructure structure;
-  structure.model = "spline";
-  structure.even_terms = 1;
-  structure.grid = 6;
-  const LensPtr plain = makeLens(structure, {645.3, 473.1}, 285.0, 95 * kDegree);
-  Eigen::VectorXd numbers = plain->parameters();
-  std::mt19937 random(3);
-  std::uniform_real_distribution<double> unit(-0.004, 0.004);
-  for (double& value : numbers.tail(72)) value = unit(random);
-  const LensPtr truth = plain->withParameters(numbers);
+  const LensPtr truth = test::bentLens();
   ASSERT_NE(truth, nullptr);
-  BoardScene scene = wideScene(5, 0.1);
-  scene.views = 44;
-  scene.cols = scene.rows = 10;
-  scene.square = 0.02;
-  const Detections detections = test::simulatedBoards(*truth, scene);
+  const Detections detections = test::simulatedBoards(*truth, test::bentScene(44));
   const CalibrationResult result = calibrate(detections, {});
   EXPECT_GT(result.points, 3000);
   EXPECT_GT(structureOf(*result.file.lens).grid, 0);

@@ -19,9 +19,9 @@ struct BoardScene {
   int rows = 6;
   double square = 0.03;  ///< [m]
   int views = 20;
-  double noise_px = 0.0;         ///< standard deviation of either coordinate
-  double outliers = 0.0;         ///< part of all corners that lie 5 to 40 px off
-  double largest_tilt = 0.9;     ///< [rad] against the line of sight
+  double noise_px = 0.0;        ///< standard deviation of either coordinate
+  double outliers = 0.0;        ///< part of all corners that lie 5 to 40 px off
+  double largest_tilt = 0.9;    ///< [rad] against the line of sight
   double least_distance = 0.1;  ///< [m]
   double largest_distance = 0.3;
   Eigen::Vector2d warp = Eigen::Vector2d::Zero();  ///< [m], see CalibrationResult::board_warp
@@ -105,6 +105,43 @@ inline Detections simulatedBoards(const LensModel& lens, const BoardScene& scene
     }
   }
   return detections;
+}
+
+/// 190 degrees over 1280x960, as most simulated calibrations see them.
+inline LensPtr wideLens() {
+  return makeLens("asphere", {645.3, 473.1},
+                  {{"f", {285.0}}, {"alpha", {0.66}}, {"beta", {1.05}}, {"a4", {0.02}}},
+                  95 * M_PI / 180.0, "test");
+}
+
+inline BoardScene wideScene(unsigned seed, double noise_px) {
+  BoardScene scene;
+  scene.seed = seed;
+  scene.noise_px = noise_px;
+  return scene;
+}
+
+/// A lens with a 2-D spline that no radial surface can say.
+inline LensPtr bentLens() {
+  LensStructure structure;
+  structure.model = "spline";
+  structure.even_terms = 1;
+  structure.grid = 6;
+  const LensPtr plain = makeLens(structure, {645.3, 473.1}, 285.0, 95 * M_PI / 180.0);
+  Eigen::VectorXd numbers = plain->parameters();
+  std::mt19937 random(3);
+  std::uniform_real_distribution<double> unit(-0.004, 0.004);
+  for (double& value : numbers.tail(72)) value = unit(random);
+  return plain->withParameters(numbers);
+}
+
+/// What it takes to calibrate that lens: many corners.
+inline BoardScene bentScene(int views) {
+  BoardScene scene = wideScene(5, 0.1);
+  scene.views = views;
+  scene.cols = scene.rows = 10;
+  scene.square = 0.02;
+  return scene;
 }
 
 }  // namespace omnister::test
