@@ -1,8 +1,8 @@
 # The catkin side of the package: messages, exports, install destinations.
 set(OMNISTER_CATKIN_COMPONENTS
-  actionlib actionlib_msgs cv_bridge diagnostic_updater dynamic_reconfigure geometry_msgs
+  actionlib actionlib_msgs cv_bridge diagnostic_msgs diagnostic_updater dynamic_reconfigure geometry_msgs
   image_transport interactive_markers message_filters message_generation nodelet pluginlib rosbag rosbag_storage roscpp
-  sensor_msgs std_msgs std_srvs tf2 tf2_ros visualization_msgs)
+  sensor_msgs std_msgs std_srvs tf2 tf2_msgs tf2_ros visualization_msgs)
 find_package(catkin REQUIRED COMPONENTS ${OMNISTER_CATKIN_COMPONENTS})
 
 file(GLOB OMNISTER_MSG_FILES CONFIGURE_DEPENDS RELATIVE ${PROJECT_SOURCE_DIR}/msg msg/*.msg)

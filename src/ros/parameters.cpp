@@ -65,12 +65,12 @@ std::string Parameters::text(const std::string& key, const std::string& fallback
 }
 
 std::string Parameters::choice(const std::string& key, const std::string& fallback,
-                               std::initializer_list<const char*> choices) {
+                               const std::vector<std::string>& choices) {
   const std::string value = text(key, fallback);
   std::string list;
-  for (const char* choice : choices) {
+  for (const std::string& choice : choices) {
     if (value == choice) return value;
-    list += (list.empty() ? "" : ", ") + std::string(choice);
+    list += (list.empty() ? "" : ", ") + choice;
   }
   refuse(key, "is \"" + printable(value) + "\", expected one of " + list);
 }

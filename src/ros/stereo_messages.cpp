@@ -3,6 +3,7 @@
 
 #include <sensor_msgs/image_encodings.h>
 
+#include <array>
 #include <boost/make_shared.hpp>
 #include <cstring>
 #include <limits>
@@ -19,8 +20,10 @@ struct Point {
   float x, y, z;
   std::uint32_t rgb;  ///< 0x00RRGGBB; the field is declared float32, as PCL has it
   float sigma, score;
+  float range;  ///< length of (x, y, z), for who colours or filters by it
 };
-static_assert(sizeof(Point) == 24, "the layout is that of the fields below");
+constexpr std::array<const char*, 7> kFields = {"x", "y", "z", "rgb", "sigma", "score", "range"};
+static_assert(sizeof(Point) == kFields.size() * sizeof(float), "the layout is that of kFields");
 
 constexpr std::uint8_t kBigEndian =
 #if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
@@ -48,7 +51,7 @@ void layOut(cv::Size size, const std_msgs::Header& header, sensor_msgs::PointClo
   message->height = static_cast<std::uint32_t>(size.height);
   message->fields.clear();
   std::uint32_t offset = 0;
-  for (const char* name : {"x", "y", "z", "rgb", "sigma", "score"}) {
+  for (const char* name : kFields) {
     sensor_msgs::PointField field;
     field.name = name;
     field.offset = offset;
@@ -81,7 +84,8 @@ sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Hea
     const auto* sigma = cloud.sigma.ptr<float>(v);
     const auto* score = cloud.score.ptr<float>(v);
     for (int u = 0; u < cloud.xyz.cols; ++u, out += sizeof(Point)) {
-      const Point point{xyz[u][0], xyz[u][1], xyz[u][2], packed(bgr[u]), sigma[u], score[u]};
+      const auto range = static_cast<float>(cv::norm(xyz[u]));
+      const Point point{xyz[u][0], xyz[u][1], xyz[u][2], packed(bgr[u]), sigma[u], score[u], range};
       std::memcpy(out, &point, sizeof point);
     }
   }
@@ -108,10 +112,15 @@ void fillPointCloud(const MatchResult& match, const cv::Mat& rays, const cv::Mat
         std::uint8_t* out = message->data.data() + row * message->row_step;
         const auto fill = [&](const auto* grey_or_color, const auto& rgb) {
           for (int u = 0; u < size.width; ++u, out += sizeof(Point)) {
-            // Without a range all three are NaN.
+            // Without a range all of them are NaN.
             const float r = range[u];
-            const Point point{r * ray[u][0],         r * ray[u][1], r * ray[u][2],
-                              rgb(grey_or_color[u]), sigma[u],      score[u]};
+            const Point point{r * ray[u][0],
+                              r * ray[u][1],
+                              r * ray[u][2],
+                              rgb(grey_or_color[u]),
+                              sigma[u],
+                              score[u],
+                              r};
             std::memcpy(out, &point, sizeof point);
           }
         };
@@ -135,14 +144,14 @@ Cloud fromPointCloud(const sensor_msgs::PointCloud2& message) {
   if (message.point_step != sizeof(Point) ||
       message.row_step != static_cast<std::uint64_t>(message.point_step) * message.width ||
       message.data.size() != points * sizeof(Point))
-    refuse("data", "does not agree with width, height and a step of 24 bytes a point");
-  const char* const names[] = {"x", "y", "z", "rgb", "sigma", "score"};
-  if (message.fields.size() != 6) refuse("fields", "are not x y z rgb sigma score");
-  for (std::size_t i = 0; i < 6; ++i) {
+    refuse("data", "does not agree with width, height and a step of 28 bytes a point");
+  const std::string expected = "are not x y z rgb sigma score range of float32";
+  if (message.fields.size() != kFields.size()) refuse("fields", expected);
+  for (std::size_t i = 0; i < kFields.size(); ++i) {
     const sensor_msgs::PointField& field = message.fields[i];
-    if (field.name != names[i] || field.offset != i * sizeof(float) ||
+    if (field.name != kFields[i] || field.offset != i * sizeof(float) ||
         field.datatype != sensor_msgs::PointField::FLOAT32 || field.count != 1)
-      refuse("fields", "are not x y z rgb sigma score of float32");
+      refuse("fields", expected);
   }
   const cv::Size size(static_cast<int>(message.width), static_cast<int>(message.height));
   Cloud cloud{cv::Mat(size, CV_32FC3), cv::Mat(size, CV_8UC3), cv::Mat(size, CV_32FC1),

@@ -1,9 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "stereo_parameters.h"
 
+#include <algorithm>
+#include <tuple>
+
 #include "omnister/common/error.h"
 #include "omnister/common/image_file.h"
 #include "omnister/stereo/input_region.h"
+#include "omnister/stereo/presets.h"
 #include "omnister/view/epipolar_overlay.h"
 
 namespace omnister {
@@ -19,11 +23,35 @@ cv::Mat loadMask(const std::string& path) {
   return readImage(path, ImageColor::kGray);
 }
 
+std::vector<std::string> presetNames() {
+  std::vector<std::string> names = {"custom"};
+  for (const MatchingPreset& preset : matchingPresets()) names.push_back(preset.name);
+  return names;
+}
+
 void applyPreset(StereoConfig& config) {
   if (config.preset == "custom") return;
+  const MatchingPreset& preset = matchingPreset(config.preset);
   config.matcher = "sweep";
-  config.positions = config.preset == "accurate" ? 4 : 1;
   config.hypotheses = 0;
+  config.positions = preset.positions;
+  config.reduce = preset.reduce;
+  config.refine = preset.refine;
+}
+
+void settlePreset(StereoConfig& config, const StereoConfig& before) {
+  const std::vector<std::string> names = presetNames();
+  if (std::find(names.begin(), names.end(), config.preset) == names.end())
+    config.preset = before.preset;
+  StereoConfig preset = config;
+  applyPreset(preset);
+  const auto values = [](const StereoConfig& c) {
+    return std::tie(c.matcher, c.hypotheses, c.positions, c.reduce, c.refine);
+  };
+  if (config.preset != before.preset)
+    config = preset;
+  else if (values(config) != values(preset))
+    config.preset = "custom";
 }
 
 StereoConfig toConfig(const StereoParameters& parameters) {
@@ -126,7 +154,7 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   const double rate = parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)");
   result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
   result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
-  result.preset = parameters.choice("preset", "custom", {"custom", "balanced", "accurate"});
+  result.preset = parameters.choice("preset", "custom", presetNames());
   result.drift = loadDriftParameters(parameters);
   result.epipolar_pixels = parameters.text("epipolar_pixels", "");
   parsePixels(result.epipolar_pixels, "~epipolar_pixels");

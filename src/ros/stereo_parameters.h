@@ -4,6 +4,7 @@
 
 #include <opencv2/core/mat.hpp>
 #include <string>
+#include <vector>
 
 #include "omnister/ros/stereo_pipeline.h"
 #include "omnister/stereo/matching_limits.h"
@@ -16,8 +17,14 @@ inline const cv::Size kAnySize(kMaxImageSide, kMaxImageSide);
 /// @param path image file; empty: none  @throws IoError or InputError
 cv::Mat loadMask(const std::string& path);
 
+/// `custom` and the names of matchingPresets().
+std::vector<std::string> presetNames();
+
 /// Sets what the preset stands for.
 void applyPreset(StereoConfig& config);
+/// A preset that was just chosen sets its values; one whose values were then changed is `custom`.
+/// @param before what held; an unknown preset stays what it was
+void settlePreset(StereoConfig& config, const StereoConfig& before);
 
 StereoConfig toConfig(const StereoParameters& parameters);
 /// All but the mask's pixels. @param config that holds

@@ -195,14 +195,7 @@ void StereoPipeline::configure(StereoConfig& config) {
   if (!known(config.matcher, {"sweep", "thesis"})) config.matcher = before.matcher;
   if (!known(config.cost, {"census", "zncc", "eq3.1"})) config.cost = before.cost;
   if (!known(config.window, {"surface", "ray", "fronto", "best"})) config.window = before.window;
-  if (!known(config.preset, {"custom", "balanced", "accurate"})) config.preset = before.preset;
-  StereoConfig preset = config;
-  applyPreset(preset);
-  if (config.preset != before.preset)
-    config = preset;
-  else if (preset.positions != config.positions || preset.hypotheses != config.hypotheses ||
-           preset.matcher != config.matcher)
-    config.preset = "custom";
+  settlePreset(config, before);
   take(config, live_);
   ++generation_;
   pairing_.setOptions(live_.pairing);

@@ -6,6 +6,7 @@
 #include <gmock/gmock.h>
 #include <omnister/StageTimes.h>
 #include <sensor_msgs/PointCloud2.h>
+#include <sensor_msgs/point_cloud2_iterator.h>
 #include <tf2_ros/static_transform_broadcaster.h>
 #include <visualization_msgs/MarkerArray.h>
 
@@ -318,12 +319,30 @@ TEST(Stereo, IsTunedLiveWithinItsLimits) {
   EXPECT_EQ(crossed.epipolar_pixels, "");
   StereoConfig preset = configure(private_node, [](StereoConfig& c) { c.preset = "accurate"; });
   EXPECT_EQ(preset.positions, 4);
+  EXPECT_TRUE(preset.refine);
   preset = configure(private_node, [](StereoConfig& c) { c.preset = "balanced"; });
   EXPECT_EQ(preset.positions, 1);
   EXPECT_EQ(preset.hypotheses, 0);
-  preset = configure(private_node, [](StereoConfig& c) { c.hypotheses = 99; });
-  EXPECT_EQ(preset.preset, "custom");
+  EXPECT_EQ(preset.reduce, 1);
+  EXPECT_FALSE(preset.refine);
+  preset = configure(private_node, [](StereoConfig& c) { c.preset = "fast"; });
+  EXPECT_EQ(preset.reduce, 2);
+  preset = configure(private_node, [](StereoConfig& c) { c.max_range = 3.0; });
+  EXPECT_EQ(preset.preset, "fast") << "says nothing of ranges";
+  const ros::Time later = stamp + ros::Duration(8.0);
+  publishPair(camera, stamp + ros::Duration(6.0), later);
+  ASSERT_TRUE(eventually([&] { return ranges.last()->header.stamp == later; }));
+  EXPECT_EQ(ranges.last()->width, 200u) << "half of 400";
+  for (const auto& change :
+       {std::function<void(StereoConfig&)>([](StereoConfig& c) { c.reduce = 3; }),
+        std::function<void(StereoConfig&)>([](StereoConfig& c) { c.refine = true; }),
+        std::function<void(StereoConfig&)>([](StereoConfig& c) { c.hypotheses = 99; })}) {
+    configure(private_node, [](StereoConfig& c) { c.preset = "balanced"; });
+    preset = configure(private_node, change);
+    EXPECT_EQ(preset.preset, "custom");
+  }
   EXPECT_EQ(preset.hypotheses, 99);
+  EXPECT_EQ(configure(private_node, [](StereoConfig& c) { c.preset = "best"; }).preset, "custom");
 
   ASSERT_TRUE(eventually([&] { return times.size() >= 2; }));
   const StageTimes& first = *times.messages().front();
@@ -740,6 +759,15 @@ TEST(StereoMessages, CloudsComeBackAsTheyWent) {
   EXPECT_EQ(cv::norm(back.bgr, cloud.bgr, cv::NORM_INF), 0.0);
   EXPECT_EQ(cv::norm(back.sigma, cloud.sigma, cv::NORM_INF), 0.0);
   EXPECT_EQ(cv::norm(back.score, cloud.score, cv::NORM_INF), 0.0);
+  const auto ranges = [](const sensor_msgs::PointCloud2& of) {
+    cv::Mat result(3, 5, CV_32FC1);
+    sensor_msgs::PointCloud2ConstIterator<float> in(of, "range");
+    for (int i = 0; i < 15; ++i, ++in) result.at<float>(i / 5, i % 5) = *in;
+    return result;
+  };
+  for (int v = 0; v < 3; ++v)
+    for (int u = 0; u < 5; ++u)
+      EXPECT_FLOAT_EQ(ranges(*message).at<float>(v, u), cv::norm(cloud.xyz.at<cv::Vec3f>(v, u)));
   // Filled right from a match it is the same, and so is one that was filled before.
   MatchResult match;
   match.range = cloud.sigma * 3.0;
@@ -763,6 +791,12 @@ TEST(StereoMessages, CloudsComeBackAsTheyWent) {
     }
     EXPECT_EQ(cv::norm(a.bgr, b.bgr, cv::NORM_INF), 0.0);
     EXPECT_TRUE(std::isnan(a.xyz.at<cv::Vec3f>(1, 2)[0]));
+    cv::Mat along = ranges(filled);
+    EXPECT_TRUE(std::isnan(along.at<float>(1, 2)));
+    along.at<float>(1, 2) = match.range.at<float>(0, 0);
+    cv::Mat expected = match.range.clone();
+    expected.at<float>(1, 2) = expected.at<float>(0, 0);
+    EXPECT_EQ(cv::norm(along, expected, cv::NORM_INF), 0.0);
   }
   EXPECT_THROW(fillPointCloud(match, cloud.xyz, cv::Mat(2, 2, CV_8UC1), {}, 1, &filled), Error);
   sensor_msgs::PointCloud2 spoiled = *message;

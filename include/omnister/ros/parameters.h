@@ -6,7 +6,6 @@
 #include <ros/node_handle.h>
 
 #include <Eigen/Core>
-#include <initializer_list>
 #include <set>
 #include <string>
 #include <vector>
@@ -28,7 +27,7 @@ class Parameters {
   /// number).
   std::string text(const std::string& key, const std::string& fallback);
   std::string choice(const std::string& key, const std::string& fallback,
-                     std::initializer_list<const char*> choices);
+                     const std::vector<std::string>& choices);
   /// A finite number in [min, max]. @param unit for the message, e.g. "m"
   double number(const std::string& key, double fallback, double min, double max,
                 const std::string& unit = "");

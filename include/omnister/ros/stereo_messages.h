@@ -10,7 +10,8 @@
 namespace omnister {
 
 /// Organized cloud on the reference image's grid: x y z [m], rgb (packed as PCL and rviz read it),
-/// sigma [m], score (0 to 1), all float32; NaN where invalid (REP 117). is_dense is false.
+/// sigma [m], score (0 to 1), range along the ray [m], all float32; NaN where invalid (REP 117).
+/// is_dense is false.
 sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Header& header);
 
 /// The same right from a match, without a cloud between: for a node that is in a hurry.

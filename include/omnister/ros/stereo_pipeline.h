@@ -50,7 +50,7 @@ struct StereoParameters {
   double min_period = 0.0;  ///< between the beginnings of two matches [s]; of `max_rate`
   MatcherOptions matching;  ///< with the mask
   std::string matcher = "sweep";
-  std::string preset = "custom";   ///< of positions, hypotheses and matcher, see cfg/Stereo.cfg
+  std::string preset = "custom";   ///< see matchingPresets(), cfg/Stereo.cfg
   std::string cost = "census";     ///< see parseMatchCost()
   std::string window = "surface";  ///< see parseMatchWindow()
   std::string mask;                ///< image file; empty: none
