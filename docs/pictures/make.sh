@@ -70,6 +70,6 @@ PY
 /usr/bin/python3 "$work/take.py" "$work/epipolar.ppm"
 import -window root "$work/rviz.png"
 small=(-strip -dither FloydSteinberg -colors 96 -define png:compression-level=9)
-convert "$work/rviz.png" -crop 900x700+365+110 +repage -resize 720x "${small[@]}" "$out/cloud.png"
+convert "$work/rviz.png" -crop 980x560+290+64 +repage -resize 720x "${small[@]}" "$out/cloud.png"
 convert "$work/epipolar.ppm" -crop 100%x84%+0+60 +repage -resize 900x "${small[@]}" "$out/epipolar.png"
 ls -l "$out"/*.png

@@ -15,14 +15,6 @@ constexpr int kSectors = 48;
 constexpr double kFullColour =
     0.15;  // of the height: departure from the sphere shown in full colour
 
-geometry_msgs::Point toPoint(const Eigen::Vector3d& p) {
-  geometry_msgs::Point point;
-  point.x = p.x();
-  point.y = p.y();
-  point.z = p.z();
-  return point;
-}
-
 std_msgs::ColorRGBA colour(double r, double g, double b, double a) {
   std_msgs::ColorRGBA c;
   c.r = static_cast<float>(r);
@@ -86,6 +78,14 @@ void addMesh(const std::vector<Eigen::Vector3d>& vertices,
 }
 
 }  // namespace
+
+geometry_msgs::Point toPoint(const Eigen::Vector3d& p) {
+  geometry_msgs::Point point;
+  point.x = p.x();
+  point.y = p.y();
+  point.z = p.z();
+  return point;
+}
 
 visualization_msgs::MarkerArray lensMarkers(const LensFile& file, const std::string& frame_id,
                                             double scale, double field_radius) {

@@ -6,6 +6,9 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <vector>
+
+#include "omnister/ros/lens_markers.h"
 
 namespace omnister {
 namespace {
@@ -17,6 +20,23 @@ using visualization_msgs::Marker;
 
 constexpr char kName[] = "stage";
 constexpr double kShownStep = 5e-4;  // [m] below this the marker stays where it is
+// The rail lies so far below the camera [m], where the lens surface does not hide it.
+constexpr double kBelow = 0.2;
+constexpr double kEndStop = 0.05;  // [m] height of the marks at the ends of the travel
+
+/// Down, square to the travel; where that is upright, forward.
+Eigen::Vector3d beside(const Eigen::Vector3d& axis) {
+  const Eigen::Vector3d wish = std::abs(axis.z()) < 0.9 ? Eigen::Vector3d(-Eigen::Vector3d::UnitZ())
+                                                        : Eigen::Vector3d::UnitX();
+  return (wish - wish.dot(axis) * axis).normalized();
+}
+
+geometry_msgs::Pose poseAt(double position, const Eigen::Vector3d& axis) {
+  geometry_msgs::Pose pose;
+  pose.position = toPoint(axis * position + kBelow * beside(axis));
+  pose.orientation.w = 1.0;
+  return pose;
+}
 
 StageMarkerParameters load(const ros::NodeHandle& private_node) {
   Parameters parameters(private_node);
@@ -70,11 +90,7 @@ void StageMarker::insert(double position, const std::string& text) {
   marker.name = kName;
   marker.description = text;
   marker.scale = 0.25F;
-  const Eigen::Vector3d at = parameters_.axis * position;
-  marker.pose.position.x = at.x();
-  marker.pose.position.y = at.y();
-  marker.pose.position.z = at.z();
-  marker.pose.orientation.w = 1.0;
+  marker.pose = poseAt(position, parameters_.axis);
   // rviz moves along the x axis of the control.
   const Eigen::Quaterniond along =
       Eigen::Quaterniond::FromTwoVectors(Eigen::Vector3d::UnitX(), parameters_.axis);
@@ -107,14 +123,14 @@ void StageMarker::insert(double position, const std::string& text) {
   rail.color.r = rail.color.g = rail.color.b = 0.7F;
   rail.color.a = 0.8F;
   rail.pose.orientation.w = 1.0;
+  std::vector<geometry_msgs::Point> ends;
   for (const double end : {parameters_.min_m, parameters_.max_m}) {
-    geometry_msgs::Point point;
-    const Eigen::Vector3d p = parameters_.axis * end;
-    point.x = p.x();
-    point.y = p.y();
-    point.z = p.z();
-    rail.points.push_back(point);
+    const Eigen::Vector3d down = beside(parameters_.axis);
+    rail.points.push_back(toPoint(parameters_.axis * end + (kBelow - 0.5 * kEndStop) * down));
+    rail.points.push_back(toPoint(parameters_.axis * end + (kBelow + 0.5 * kEndStop) * down));
+    ends.push_back(toPoint(parameters_.axis * end + kBelow * down));
   }
+  rail.points.insert(rail.points.end(), ends.begin(), ends.end());
   body.markers.push_back(rail);
   marker.controls.push_back(body);
 
@@ -135,13 +151,7 @@ void StageMarker::onState(const StageState::ConstPtr& state) {
   if (text != shown_text_ && !state->moving) {
     insert(position, text);
   } else if (std::abs(position - shown_position_) > kShownStep) {
-    geometry_msgs::Pose pose;
-    const Eigen::Vector3d at = parameters_.axis * position;
-    pose.position.x = at.x();
-    pose.position.y = at.y();
-    pose.position.z = at.z();
-    pose.orientation.w = 1.0;
-    server_.setPose(kName, pose);
+    server_.setPose(kName, poseAt(position, parameters_.axis));
     server_.applyChanges();
     shown_position_ = position;
   }

@@ -138,7 +138,7 @@ std::string calibrationReport(const std::string& title, const Detections& detect
     for (const Point& point : points) {
       plot.dot((point.pixel - center).norm(), std::min(top, point.residual.norm()));
     }
-    figure(plot.finish("radius [px]", "residual [px]", 2), "Residual against radius");
+    figure(plot.finish("radius [px]", "residual [px]"), "Residual against radius");
   }
   {
     Plot plot(520, 300, -180, 180, 0, top);
@@ -148,7 +148,7 @@ std::string calibrationReport(const std::string& title, const Detections& detect
       plot.dot(std::atan2(offset.y(), offset.x()) * 180 / kPi,
                std::min(top, point.residual.norm()));
     }
-    figure(plot.finish("azimuth [degrees]", "residual [px]", 2), "Residual against azimuth");
+    figure(plot.finish("azimuth [degrees]", "residual [px]"), "Residual against azimuth");
   }
 
   html += "<h2>Coverage and uncertainty</h2>\n";

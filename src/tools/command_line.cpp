@@ -42,9 +42,9 @@ void addDoctor(CLI::App& app);
 namespace {
 
 constexpr AddCommand kCommands[] = {
-    addCalibrate, addCalibrateScan, addCalibrateStereo, addImport, addExport, addProject,
-    addUnproject, addStereo,        addEvaluate,        addRender, addDewarp, addTarget,
-    addStore,
+    addCalibrate, addCalibrateScan, addCalibrateStereo, addImport,   addExport,
+    addProject,   addUnproject,     addStereo,          addEvaluate, addRender,
+    addDewarp,    addTarget,        addStore,
 #ifdef OMNISTER_WITH_ROS
     addBag,
 #endif
@@ -101,14 +101,16 @@ Progress consoleProgress() {
     Clock::time_point start = Clock::now();
     Clock::time_point last = start;
     std::string stage;
+    double fraction = 0.0;
   };
   const bool terminal = ::isatty(STDERR_FILENO) == 1;
   return [state = std::make_shared<State>(), terminal](double fraction, const std::string& stage) {
     const auto now = Clock::now();
-    if (stage != state->stage) {
-      state->stage = stage;
-      state->start = now;
-    }
+    // Stages that each begin at nothing are timed by themselves; those that share one whole,
+    // together.
+    if (stage != state->stage && fraction <= state->fraction) state->start = now;
+    state->stage = stage;
+    state->fraction = fraction;
     // What is over at once needs no line, least of all before an error.
     if (now - state->last < std::chrono::milliseconds(terminal ? 200 : 2000)) return;
     state->last = now;

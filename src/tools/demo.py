@@ -276,7 +276,7 @@ def start_screen(processes, clock):
 
 def colours_in(picture):
     """How many colours the part of the picture has where rviz draws the scene."""
-    done = subprocess.run(['convert', str(picture), '-crop', '800x700+420+200', '-format', '%k', 'info:'],
+    done = subprocess.run(['convert', str(picture), '-crop', '900x480+330+100', '-format', '%k', 'info:'],
                           stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     return int(done.stdout) if done.returncode == 0 and done.stdout.isdigit() else 0
 

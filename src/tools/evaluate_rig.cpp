@@ -63,7 +63,7 @@ std::string againstRadius(const Eigen::Vector2d& center, const std::vector<Eigen
   for (std::size_t i = 0; i < pixels.size(); ++i) {
     plot.dot((pixels[i] - center).norm(), errors[i]);
   }
-  return asImage(plot.finish("radius [px]", name, 2));
+  return asImage(plot.finish("radius [px]", name));
 }
 
 void runBoard(const BoardArguments& arguments, bool json) {

@@ -131,20 +131,48 @@ void Plot::text(double px, double py, const std::string& words) {
   cairo_show_text(cairo_.get(), words.c_str());
 }
 
-std::string Plot::finish(const std::string& x_name, const std::string& y_name, int digits) {
+void Plot::ticks(double low, double high,
+                 const std::function<void(double, const std::string&)>& put) {
+  // Steps of 1, 2 or 5 times a power of ten, four to nine of them.
+  const double rough = std::abs(high - low) / 5.0;
+  if (!(rough > 0.0) || !std::isfinite(rough)) return;
+  const double power = std::pow(10.0, std::floor(std::log10(rough)));
+  const double step = power * (rough < 1.5 * power   ? 1.0
+                               : rough < 3.5 * power ? 2.0
+                               : rough < 7.5 * power ? 5.0
+                                                     : 10.0);
+  const int digits = std::max(0, static_cast<int>(-std::floor(std::log10(step) + 1e-9)));
+  const double first = std::ceil(std::min(low, high) / step - 1e-9);
+  const double last = std::floor(std::max(low, high) / step + 1e-9);
+  // Added to zero, minus zero becomes zero.
+  for (double i = first; i <= last; i += 1.0) put(i * step + 0.0, fixed(i * step + 0.0, digits));
+}
+
+std::string Plot::finish(const std::string& x_name, const std::string& y_name) {
+  const auto width = [this](const std::string& words) {
+    cairo_text_extents_t extents;
+    cairo_text_extents(cairo_.get(), words.c_str(), &extents);
+    return extents.x_advance;
+  };
+  const double bottom = height_ - kBottom;
   color(0, 0, 0);
   cairo_set_line_width(cairo_.get(), 1.0);
-  cairo_rectangle(cairo_.get(), kLeft, kMargin, width_ - kLeft - kMargin,
-                  height_ - kBottom - kMargin);
+  cairo_rectangle(cairo_.get(), kLeft, kTop, width_ - kLeft - kRight, bottom - kTop);
   cairo_stroke(cairo_.get());
-  for (int i = 0; i <= 4; ++i) {
-    const double vx = x0_ + (x1_ - x0_) * i / 4.0;
-    const double vy = y0_ + (y1_ - y0_) * i / 4.0;
-    text(x(vx) - 10, height_ - kBottom + 14, fixed(vx, std::abs(x1_ - x0_) < 5 ? 2 : 0));
-    text(2, y(vy) + 4, fixed(vy, std::abs(y1_ - y0_) < 5 ? std::max(digits, 2) : digits));
-  }
-  text(0.5 * width_ - 40, height_ - 4, x_name);
-  text(2, 10, y_name);
+  ticks(x0_, x1_, [&](double value, const std::string& number) {
+    cairo_move_to(cairo_.get(), x(value), bottom);
+    cairo_line_to(cairo_.get(), x(value), bottom - 4);
+    cairo_stroke(cairo_.get());
+    text(x(value) - 0.5 * width(number), bottom + 14, number);
+  });
+  ticks(y0_, y1_, [&](double value, const std::string& number) {
+    cairo_move_to(cairo_.get(), kLeft, y(value));
+    cairo_line_to(cairo_.get(), kLeft + 4, y(value));
+    cairo_stroke(cairo_.get());
+    text(kLeft - 4 - width(number), y(value) + 4, number);
+  });
+  text(0.5 * (kLeft + width_ - kRight - width(x_name)), height_ - 4, x_name);
+  text(2, 11, y_name);
   cairo_.reset();
   cairo_surface_finish(surface_.get());
   return svg_;

@@ -5,6 +5,7 @@
 #include <cairo.h>
 
 #include <algorithm>
+#include <functional>
 #include <memory>
 #include <opencv2/core/mat.hpp>
 #include <string>
@@ -54,10 +55,10 @@ class Plot {
   Plot(double width, double height, double x0, double x1, double y0, double y1);
 
   double x(double value) const {
-    return kLeft + (value - x0_) / (x1_ - x0_) * (width_ - kLeft - kMargin);
+    return kLeft + (value - x0_) / (x1_ - x0_) * (width_ - kLeft - kRight);
   }
   double y(double value) const {
-    return height_ - kBottom - (value - y0_) / (y1_ - y0_) * (height_ - kBottom - kMargin);
+    return height_ - kBottom - (value - y0_) / (y1_ - y0_) * (height_ - kBottom - kTop);
   }
 
   void color(double red, double green, double blue) {
@@ -70,12 +71,17 @@ class Plot {
   void text(double px, double py, const std::string& words);
 
   /// Frame, numbers and names of the axes; closes the drawing. @return the SVG element
-  std::string finish(const std::string& x_name, const std::string& y_name, int digits = 0);
+  std::string finish(const std::string& x_name, const std::string& y_name);
 
  private:
+  /// Round numbers between the two, as they are written.
+  static void ticks(double low, double high,
+                    const std::function<void(double, const std::string&)>& put);
+
   static constexpr double kLeft = 48;
+  static constexpr double kRight = 20;
+  static constexpr double kTop = 22;
   static constexpr double kBottom = 34;
-  static constexpr double kMargin = 14;
 
   struct Release {
     void operator()(cairo_surface_t* surface) const { cairo_surface_destroy(surface); }

@@ -69,7 +69,7 @@ void chapter3(double scale, int threads, Report& report) {
     plot.line(a.radius, a.combined, b.radius, b.combined);
   }
   report.body += figure(
-      asImage(plot.finish("dewarp factor R [px]", "mean error [px]", 1)),
+      asImage(plot.finish("dewarp factor R [px]", "mean error [px]")),
       "Fig. 3.3: mean error along x (red), y (blue) and of both (black) against R. "
       "Best for x " +
           fixed(dots.best_x.radius, 0) + " (thesis 470), for y " + fixed(dots.best_y.radius, 0) +

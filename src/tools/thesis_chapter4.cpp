@@ -217,7 +217,7 @@ void memory(LensRun& run, Report& report) {
         figure(asImage(many.picture, 520),
                "Fig. 5.1: dewarped pixels that show one distorted pixel, quadric; white is " +
                    std::to_string(many.most) + " (thesis: up to 8)");
-    report.body += figure(asImage(plot.finish("radius / half diagonal", "mean count", 1)),
+    report.body += figure(asImage(plot.finish("radius / half diagonal", "mean count")),
                           "Fig. 5.1: mean count against radius");
     report.body += "<table>\n" + row({"memory, two 8-bit images", "distorted", "dewarped"}, "th") +
                    row({"thesis", "12.5 MB", "42 MB"}) +

@@ -184,7 +184,7 @@ std::string axisErrorPlot(const DepthStatistics& s, double center_v, double step
   plot.line(x.low, 0, x.high, 0);
   plot.color(0.1, 0.3, 0.8);
   for (const auto& point : row) plot.dot(1e3 * point.X.x(), 1e3 * point.residual, 2.0);
-  return asImage(plot.finish("x [mm]", "error [mm]", 1));
+  return asImage(plot.finish("x [mm]", "error [mm]"));
 }
 
 std::string windowPlot(const Shape& shape, double distance, double baseline) {

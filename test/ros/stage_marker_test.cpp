@@ -99,6 +99,7 @@ TEST_F(StageHandle, ShowsWhereTheStageIs) {
   const visualization_msgs::InteractiveMarker marker = inits.last()->markers[0];
   EXPECT_EQ(marker.header.frame_id, "stage_base");
   EXPECT_NEAR(marker.pose.position.y, -position(), 2e-3);
+  EXPECT_NEAR(marker.pose.position.z, -0.2, 1e-6) << "below the lens surface, which would hide it";
   EXPECT_EQ(marker.menu_entries.size(), 3u);
 }
 

@@ -2,11 +2,17 @@
 /// @file A lens as rviz shows it.
 #pragma once
 
+#include <geometry_msgs/Point.h>
 #include <visualization_msgs/MarkerArray.h>
+
+#include <Eigen/Core>
 
 #include "omnister/lens/lens_file.h"
 
 namespace omnister {
+
+/// A point of a marker.
+geometry_msgs::Point toPoint(const Eigen::Vector3d& p);
 
 /// Three markers in the camera's optical frame, by namespace:
 /// - `surface`: the lens surface, a mesh of points (x, y, h(x, y)) along their true rays, coloured
