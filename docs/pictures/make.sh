@@ -39,6 +39,7 @@ cat >"$work/pictures.launch" <<XML
 XML
 roslaunch -p "$port" "$work/pictures.launch" >"$work/roslaunch.log" 2>&1 &
 pids+=($!)
+until rostopic list >/dev/null 2>&1; do sleep 0.5; done
 cat >"$work/take.py" <<'PY'
 import sys
 import numpy

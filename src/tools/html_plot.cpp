@@ -126,6 +126,14 @@ void Plot::box(double ax, double ay, double bx, double by) {
   cairo_fill(cairo_.get());
 }
 
+void Plot::errorCell(double ax, double ay, double bx, double by, double level) {
+  level = std::clamp(level, -1.0, 1.0);
+  color(level > 0 ? 1.0 : 1.0 + level, 1.0 - std::abs(level), level < 0 ? 1.0 : 1.0 - level);
+  box(ax, ay, bx, by);
+  color(0.6, 0.6, 0.6);
+  dot(0.5 * (ax + bx), 0.5 * (ay + by), 0.7);
+}
+
 void Plot::text(double px, double py, const std::string& words) {
   cairo_move_to(cairo_.get(), px, py);
   cairo_show_text(cairo_.get(), words.c_str());

@@ -67,6 +67,9 @@ class Plot {
   void dot(double px, double py, double radius = 1.3);
   void line(double ax, double ay, double bx, double by);
   void box(double ax, double ay, double bx, double by);
+  /// A part of an image and its error: white at level 0, red at 1, blue at -1, with a dot in its
+  /// middle that tells it from what is empty.
+  void errorCell(double ax, double ay, double bx, double by, double level);
   /// @param px, py in the drawing, not in the data
   void text(double px, double py, const std::string& words);
 

@@ -140,12 +140,9 @@ std::string depthMap(const DepthStatistics& s, cv::Size size, double step) {
   Plot plot(520, 520.0 * size.height / size.width + 40, 0, size.width, size.height, 0);
   const double most = 0.1 * s.distance_m;
   for (const auto& point : s.points) {
-    const double level = std::clamp(point.residual / most, -1.0, 1.0);
-    plot.color(level > 0 ? 1.0 : 1.0 + level, 1.0 - std::abs(level), level < 0 ? 1.0 : 1.0 - level);
-    plot.box(point.pixel.x() - 0.5 * step, point.pixel.y() - 0.5 * step,
-             point.pixel.x() + 0.5 * step, point.pixel.y() + 0.5 * step);
-    plot.color(0.6, 0.6, 0.6);
-    plot.dot(point.pixel.x(), point.pixel.y(), 0.7);
+    plot.errorCell(point.pixel.x() - 0.5 * step, point.pixel.y() - 0.5 * step,
+                   point.pixel.x() + 0.5 * step, point.pixel.y() + 0.5 * step,
+                   point.residual / most);
   }
   return asImage(plot.finish("u [px]", "v [px]"));
 }

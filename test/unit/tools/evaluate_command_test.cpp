@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// `omnister evaluate thesis|board|pair` as a person calls them.
+// `omnister evaluate thesis|plane|board|pair` as a person calls them.
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
@@ -15,6 +15,7 @@
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/sim/renderer.h"
+#include "omnister/stereo/cloud.h"
 #include "temporary_folder.h"
 
 namespace omnister {
@@ -51,12 +52,28 @@ TEST_F(Evaluate, ThesisMakesOnePageAndItsFigures) {
   const json figures = json::parse(outcome.out);
   EXPECT_EQ(figures, json::parse(readFile(path("thesis/thesis.json"))));
   const std::string page = readFile(path("thesis/index.html"));
-  for (const char* named :
-       {"Fig. 3.2", "Fig. 3.3", "Fig. 3.5", "Fig. 4.2", "Fig. 4.5", "Fig. 4.9", "Fig. 4.10",
-        "Fig. 4.12", "Figs 4.11 and 4.13", "Fig. 4.14", "Fig. 4.15", "Fig. 5.1", "Fig. 5.3",
-        "Fig. 5.6", "Fig. 5.7", "Fig. 5.8", "Table 4.1", "Table 5.1", "fig. 5.4",
-        "As fig. 5.7: quadric (our fit)", "As fig. 5.7: conic (our fit)",
-        "As fig. 5.7: asphere (our fit)"}) {
+  for (const char* named : {"Fig. 3.2",
+                            "Fig. 3.3",
+                            "Fig. 3.5",
+                            "Fig. 4.2",
+                            "Fig. 4.5",
+                            "Fig. 4.9",
+                            "Fig. 4.10",
+                            "Fig. 4.12",
+                            "Figs 4.11 and 4.13",
+                            "Fig. 4.14",
+                            "Fig. 4.15",
+                            "Fig. 5.1",
+                            "Fig. 5.3",
+                            "Fig. 5.6",
+                            "Fig. 5.7",
+                            "Fig. 5.8",
+                            "Table 4.1",
+                            "Table 5.1",
+                            "fig. 5.4",
+                            "As fig. 5.7: quadric (our fit)",
+                            "As fig. 5.7: conic (our fit)",
+                            "As fig. 5.7: asphere (our fit)"}) {
     EXPECT_THAT(page, HasSubstr(named));
   }
   EXPECT_THAT(page, Not(HasSubstr("src=\"http")));
@@ -76,6 +93,51 @@ TEST_F(Evaluate, ThesisMakesOnePageAndItsFigures) {
     EXPECT_GT(lens["fig_5_1"]["most"].get<int>(), 3) << name;
   }
   EXPECT_GE(figures["claims"].size(), 7u);
+}
+
+TEST_F(Evaluate, PlaneTellsAFlatCloudFromABentOne) {
+  const LensPtr lens = writeLens("lens.yaml", 150.0, 239.0);
+  std::mt19937 random(3);
+  std::normal_distribution<float> noise(0.0F, 0.002F);
+  // A wall 2 m ahead, its ranges too long by `bend` at 45 degrees off the axis, less so further in.
+  const auto writeWall = [&](double bend) {
+    const cv::Size size(480, 360);
+    Cloud cloud{cv::Mat(size, CV_32FC3, cv::Scalar::all(NAN)), cv::Mat::zeros(size, CV_8UC3),
+                cv::Mat(size, CV_32FC1, cv::Scalar(0.01)), cv::Mat::ones(size, CV_32FC1)};
+    for (int v = 0; v < size.height; ++v) {
+      for (int u = 0; u < size.width; ++u) {
+        const auto ray = lens->unproject({double(u), double(v)});
+        if (!ray || ray->z() < 0.5) continue;
+        const double off = 2.0 * (1.0 - ray->z() * ray->z());
+        const double range = 2.0 / ray->z() * (1.0 + bend * off + noise(random));
+        for (int i = 0; i < 3; ++i)
+          cloud.xyz.at<cv::Vec3f>(v, u)[i] = static_cast<float>(range * (*ray)[i]);
+      }
+    }
+    writeCloud(path("wall.ply"), cloud);
+  };
+  const auto check = [&](const std::string& truth) {
+    const Outcome outcome = run({"evaluate", "plane", "--cloud", path("wall.ply"), "--report",
+                                 path("report"), "--truth-height", truth, "--json"});
+    EXPECT_EQ(outcome.code, 0) << outcome.err;
+    return json::parse(outcome.out);
+  };
+  writeWall(0.0);
+  const json good = check("2");
+  EXPECT_EQ(good["verdict"], "good") << good;
+  EXPECT_LT(good["systematic_range_error"].get<double>(), 0.001);
+  EXPECT_NEAR(good["distance_m"].get<double>(), 2.0, 0.001);
+  const std::string page = readFile(path("report/report.html"));
+  EXPECT_THAT(page, HasSubstr("Range error over the image"));
+  EXPECT_THAT(page, HasSubstr("against the angle off the axis"));
+  const json farther = check("2.1");
+  EXPECT_FALSE(farther["good"].get<bool>());
+  EXPECT_THAT(farther["verdict"].get<std::string>(), HasSubstr("another distance"));
+  writeWall(0.05);
+  const json bent = check("2");
+  EXPECT_FALSE(bent["good"].get<bool>());
+  EXPECT_THAT(bent["verdict"].get<std::string>(), HasSubstr("bent")) << bent;
+  EXPECT_GT(bent["systematic_range_error"].get<double>(), 0.01);
 }
 
 TEST_F(Evaluate, BoardTellsAGoodLensFromOneThatHasDrifted) {
