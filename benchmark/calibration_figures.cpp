@@ -12,6 +12,7 @@
 #include <set>
 #include <sstream>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "measure.h"
@@ -89,8 +90,9 @@ std::vector<std::vector<double>> recordedNumbers(const fs::path& file) {
     const std::size_t begin = text.find('>', at) + 1;
     const std::size_t end = text.find("</image_", begin);
     std::istringstream words(text.substr(begin, end - begin));
-    std::vector<double>& numbers = images.emplace_back();
+    std::vector<double> numbers;
     for (std::string word; words >> word;) numbers.push_back(std::stod(word));
+    images.push_back(std::move(numbers));
     at = end + 1;
   }
   return images;

@@ -6,7 +6,9 @@
 
 #include <iostream>
 #include <sstream>
+#include <streambuf>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "tools/command_line.h"
@@ -25,12 +27,11 @@ struct Outcome {
   }
 };
 
-/// `omnister ARGUMENTS…` with this text on standard input.
-inline Outcome run(std::vector<std::string> arguments, const std::string& input = "") {
+/// `omnister ARGUMENTS…` with this on standard input.
+inline Outcome run(std::vector<std::string> arguments, std::streambuf& input) {
   // Before the first call, as it gives std::cin another buffer.
   std::ios::sync_with_stdio(false);
-  std::istringstream text(input);
-  std::streambuf* before = std::cin.rdbuf(text.rdbuf());
+  std::streambuf* before = std::cin.rdbuf(&input);
   std::cin.clear();
   arguments.insert(arguments.begin(), "omnister");
   std::vector<const char*> argv;
@@ -45,6 +46,12 @@ inline Outcome run(std::vector<std::string> arguments, const std::string& input 
   std::cin.rdbuf(before);
   std::cin.clear();
   return outcome;
+}
+
+/// `omnister ARGUMENTS…` with this text on standard input.
+inline Outcome run(std::vector<std::string> arguments, const std::string& input = "") {
+  std::istringstream text(input);
+  return run(std::move(arguments), *text.rdbuf());
 }
 
 }  // namespace omnister::test

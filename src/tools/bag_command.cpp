@@ -101,10 +101,18 @@ class RunFolder {
       return;
     }
     std::error_code error;
-    fs::create_directories(folder_, error);
+    begun_ = fs::create_directories(folder_, error);
     if (error) throw IoError("make folder", folder_.string(), error.value());
     if (arguments.restart) clear();
     writeFileAtomically(path, run.dump(2) + "\n");
+  }
+
+  /// A run that is refused leaves no folder behind that it began.
+  void removeIfBegun() const {
+    if (!begun_) return;
+    std::error_code ignored;
+    fs::remove(folder_ / "run.json", ignored);
+    fs::remove(folder_, ignored);
   }
 
   bool has(std::int64_t stamp_ns) const { return fs::exists(notePath(stamp_ns)); }
@@ -187,6 +195,7 @@ class RunFolder {
 
   const BagArguments& arguments_;
   const fs::path folder_;
+  bool begun_ = false;  ///< the folder was not there before
 };
 
 void runBagCommand(BagArguments& arguments, bool json) {
@@ -198,13 +207,19 @@ void runBagCommand(BagArguments& arguments, bool json) {
     arguments.options.matching.mask = readImage(arguments.mask, ImageColor::kGray) != 0;
   const RunFolder folder(arguments);
   std::size_t clouds = 0;
-  const BagRunSummary summary = runBag(
-      arguments.bag, arguments.options, [&](std::int64_t stamp) { return !folder.has(stamp); },
-      [&](const BagCloud& cloud) {
-        folder.write(cloud);
-        ++clouds;
-      },
-      consoleProgress());
+  BagRunSummary summary;
+  try {
+    summary = runBag(
+        arguments.bag, arguments.options, [&](std::int64_t stamp) { return !folder.has(stamp); },
+        [&](const BagCloud& cloud) {
+          folder.write(cloud);
+          ++clouds;
+        },
+        consoleProgress());
+  } catch (const Error&) {
+    if (clouds == 0) folder.removeIfBegun();
+    throw;
+  }
   const std::vector<Json> notes = folder.writeTable();
   std::vector<double> valid;
   for (const Json& note : notes) valid.push_back(note.value("valid_fraction", 0.0));

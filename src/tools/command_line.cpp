@@ -197,7 +197,9 @@ int runCommandLine(int argc, const char* const* argv) {
     closeProgressLine();
     return 0;
   } catch (const CLI::ParseError& error) {
-    return app.exit(error) == 0 ? 0 : 2;
+    if (app.exit(error) != 0) return 2;
+    if (std::cout.flush()) return 0;
+    say("omnister: cannot write to standard output");
   } catch (const Error& error) {
     say(std::string("omnister: ") + error.what());
   } catch (const std::bad_alloc&) {

@@ -17,6 +17,18 @@ namespace {
 
 constexpr std::size_t kMaxLine = 4096;
 
+/// The next line of standard input; of one that is too long as much as shows that, so that input
+/// without end is refused before it fills the memory.
+bool readLine(std::string& line) {
+  std::array<char, kMaxLine + 2> text;
+  std::cin.getline(text.data(), text.size());
+  auto count = static_cast<std::size_t>(std::cin.gcount());
+  if (count == 0) return false;
+  if (std::cin.good()) --count;  // the line feed
+  line.assign(text.data(), count);
+  return true;
+}
+
 template <std::size_t N>
 std::array<double, N> readNumbers(const std::string& line, std::size_t line_number,
                                   const char* expected) {
@@ -91,7 +103,7 @@ void convertLines(bool json, const char* key, const char* expected, const Conver
   std::cin.tie(nullptr);
   Rows<Out> rows(json, key);
   std::string line;
-  for (std::size_t number = 1; std::getline(std::cin, line); ++number) {
+  for (std::size_t number = 1; readLine(line); ++number) {
     std::array<double, In> values;
     try {
       values = readNumbers<In>(line, number, expected);

@@ -14,6 +14,7 @@
 #include <opencv2/imgcodecs.hpp>
 #include <random>
 #include <set>
+#include <streambuf>
 
 #include "command_run.h"
 #include "omnister/common/file_io.h"
@@ -452,6 +453,51 @@ TEST_F(BadInput, NonsenseForEveryNumberOfACommand) {
       }
     }
   }
+}
+
+TEST_F(BadInput, NonsenseOnStandardInput) {
+  for (const char* command : {"project", "unproject"}) {
+    const Arguments arguments = {command, "--lens", "lens.yaml"};
+    for (const auto& [what, text] : nonsense()) {
+      if (text.empty()) continue;
+      const test::Outcome outcome = test::run(arguments, text);
+      EXPECT_EQ(outcome.code, 1) << command << " took " << what;
+      EXPECT_THAT(outcome.err, StartsWith("omnister: standard input: line 1: is "));
+      EXPECT_EQ(outcome.out, "");
+      EXPECT_LE(outcome.err.size(), 400u) << what;
+    }
+    for (const char* numbers : {"nan nan", "inf -inf", "1e308 -1e308", "1e-320 0", "0 0"}) {
+      std::string line = numbers;
+      if (command == std::string("project")) line += " 0";
+      EXPECT_EQ(test::run(arguments, line + "\r\n" + line).code, 0) << line;
+    }
+  }
+}
+
+/// The letter that never ends, as of a device.
+class Endless : public std::streambuf {
+ public:
+  std::size_t taken() const { return taken_; }
+
+ private:
+  int_type underflow() override {
+    // Whoever takes all this would take everything.
+    if (taken_ > (std::size_t{1} << 24)) return traits_type::eof();
+    setg(block_.data(), block_.data(), block_.data() + block_.size());
+    taken_ += block_.size();
+    return '1';
+  }
+
+  std::string block_ = std::string(1000, '1');
+  std::size_t taken_ = 0;
+};
+
+TEST_F(BadInput, ALineWithoutEndIsNotReadToItsEnd) {
+  Endless endless;
+  const test::Outcome outcome = test::run({"project", "--lens", "lens.yaml"}, endless);
+  EXPECT_EQ(outcome.code, 1);
+  EXPECT_THAT(outcome.err, HasSubstr("line 1"));
+  EXPECT_LE(endless.taken(), 10000u);
 }
 
 TEST_F(BadInput, PlacesThatCannotBeWritten) {
