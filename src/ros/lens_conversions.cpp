@@ -3,8 +3,8 @@
 #include <limits>
 #include <set>
 
+#include "camera_info_reading.h"
 #include "omnister/common/numbers.h"
-#include "omnister/lens/lens_import.h"
 #include "omnister/ros/conversions.h"
 
 namespace omnister {
@@ -27,7 +27,7 @@ sensor_msgs::CameraInfo toCameraInfo(const LensFile& file) {
   return info;
 }
 
-LensFile fromCameraInfo(const sensor_msgs::CameraInfo& info, const std::string& source) {
+ForeignCamera readCameraInfo(const sensor_msgs::CameraInfo& info, const std::string& source) {
   // The importers know how to check these numbers, once they stand in the file that they read.
   const std::set<std::string> known = {"plumb_bob", "rational_polynomial", "equidistant"};
   if (known.count(info.distortion_model) == 0) {
@@ -52,7 +52,11 @@ LensFile fromCameraInfo(const sensor_msgs::CameraInfo& info, const std::string& 
                            "\ncamera_name: camera\ncamera_matrix: " + matrix(3, 3, info.K) +
                            "distortion_model: " + info.distortion_model +
                            "\ndistortion_coefficients: " + matrix(1, info.D.size(), info.D);
-  const ForeignCamera camera = readForeignCamera(text, source, "camera_info");
+  return readForeignCamera(text, source, "camera_info");
+}
+
+LensFile fromCameraInfo(const sensor_msgs::CameraInfo& info, const std::string& source) {
+  const ForeignCamera camera = readCameraInfo(info, source);
   const ForeignFit fit = fitForeignCamera(camera, "spline");
   constexpr double kMaxResidual = 0.5;  // [px]
   if (!(fit.fit.rms_px <= kMaxResidual)) {

@@ -22,6 +22,8 @@ GrblSimulator::GrblSimulator(const GrblOptions& options, std::shared_ptr<Simulat
       options_(options),
       mechanics_(mechanics),
       state_(options.homing_enabled ? State::kAlarm : State::kIdle) {
+  // Its thread calls as soon as it is there, and waits until cable_ is.
+  const std::lock_guard<std::mutex> lock(mutex_);
   cable_ = std::make_unique<SerialCable>(
       options.link, [this](std::string_view bytes) { onBytes(bytes); }, [this] { onTick(); });
 }

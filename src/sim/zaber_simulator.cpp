@@ -45,6 +45,8 @@ ZaberSimulator::ZaberSimulator(const ZaberOptions& options, std::shared_ptr<Simu
       mechanics_(mechanics),
       alert_(options.alerts),
       max_speed_(std::llround(mechanics.max_speed_mps / options.unit_m * kSpeedScale)) {
+  // Its thread calls as soon as it is there, and waits until cable_ is.
+  const std::lock_guard<std::mutex> lock(mutex_);
   cable_ = std::make_unique<SerialCable>(
       options.link, [this](std::string_view bytes) { onBytes(bytes); }, [this] { onTick(); });
 }
@@ -66,6 +68,7 @@ void ZaberSimulator::rejectNext(const std::string& reason) {
 }
 
 void ZaberSimulator::onBytes(std::string_view bytes) {
+  const std::lock_guard<std::mutex> lock(mutex_);
   for (const char byte : bytes) {
     if (byte != '\n' && byte != '\r') {
       buffer_.push_back(byte);
@@ -106,7 +109,6 @@ void ZaberSimulator::onLine(std::string line) {
   const int axis = address.size() < 2 ? 0 : std::stoi(address[1].substr(0, 4));
   const std::string id = address.size() < 3 ? "" : address[2];
   if (device != 0 && device != options_.device_number) return;
-  const std::lock_guard<std::mutex> lock(mutex_);
   bool accepted = true;
   std::string data;
   std::string command;

@@ -3,6 +3,7 @@
 
 #include "fuzz.h"
 #include "omnister/ros/conversions.h"
+#include "ros/camera_info_reading.h"
 
 void omnister::fuzz::fuzzOne(std::string_view bytes) {
   static const char* const kModels[] = {"plumb_bob", "rational_polynomial", "equidistant",
@@ -20,5 +21,9 @@ void omnister::fuzz::fuzzOne(std::string_view bytes) {
   };
   info.K = {number(1000), 0, number(1000), 0, number(1000), number(1000), 0, 0, 1};
   for (double& value : info.D) value = number(1.0);
+  const bool taken = takes(
+      [&] { require(readCameraInfo(info, "input").image_size.width > 0, "an image has a size"); });
+  if (!taken || !timeForMore(bytes, 4096)) return;
+  // The fit takes most of a second.
   takes([&] { fromCameraInfo(info, "input"); });
 }

@@ -41,10 +41,12 @@ inline void require(bool condition, const char* what) {
   std::abort();
 }
 
-/// Whether to do now what takes long: under libFuzzer for one in 64 inputs, always the same ones.
-inline bool timeForMore([[maybe_unused]] std::string_view bytes) {
+/// Whether to do now what takes long: under libFuzzer for one in so many inputs, always the same
+/// ones.
+inline bool timeForMore([[maybe_unused]] std::string_view bytes,
+                        [[maybe_unused]] std::size_t one_in = 64) {
 #ifdef FUZZING_BUILD_MODE_UNSAFE_FOR_PRODUCTION
-  return std::hash<std::string_view>{}(bytes) % 64 == 0;
+  return std::hash<std::string_view>{}(bytes) % one_in == 0;
 #else
   return true;
 #endif

@@ -10,12 +10,13 @@
 #include <algorithm>
 #include <cstddef>
 
-#if defined(__has_feature)
+// GCC says it by a macro, clang by a feature.
+#if defined(__SANITIZE_THREAD__)
+#define OMNISTER_THREAD_SANITIZER 1
+#elif defined(__has_feature)
 #if __has_feature(thread_sanitizer)
 #define OMNISTER_THREAD_SANITIZER 1
 #endif
-#elif defined(__SANITIZE_THREAD__)
-#define OMNISTER_THREAD_SANITIZER 1
 #endif
 #ifdef OMNISTER_THREAD_SANITIZER
 #include <atomic>
