@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <numeric>
 
 #include "sweep_level.h"
 
@@ -21,22 +22,43 @@ constexpr int kBeyond = 8;                      ///< pixels around where a plane
 constexpr float kSteepest = 1.2f;               ///< columns a pixel that a plane may rise
 
 /// Least squares, reweighted. @param rounds 1: from scratch; 3: only refined
-bool fitPlane(const std::vector<Sample>& samples, int start, Guess* guess) {
-  const std::size_t stride = std::max<std::size_t>(1, samples.size() / 96);
+bool fitPlane(const Samples& samples, int start, Plane* guess) {
+  constexpr std::size_t kLanes = 4;  // sums side by side, which makes them vectors
+  const std::size_t n = samples.size();
   Eigen::Vector3f plane((*guess).x, (*guess).y, (*guess)(kMiddleX, kMiddleY));
   for (int iteration = start - 1; iteration < 4; ++iteration) {
-    Eigen::Matrix3f A = Eigen::Matrix3f::Zero();
-    Eigen::Vector3f b = Eigen::Vector3f::Zero();
-    for (std::size_t i = 0; i < samples.size(); i += stride) {
-      const Eigen::Vector3f row(samples[i].x - kMiddleX, samples[i].y - kMiddleY, 1);
-      const float error = samples[i].columns - plane.dot(row);
-      const float scale = iteration == 1 ? 6.0f : 2.0f;
-      const float weight = iteration == 0 ? 1.0f : 1 / (1 + error * error / (scale * scale));
-      A += weight * row * row.transpose();
-      b += weight * samples[i].columns * row;
-    }
+    // Of 1 u v uu uv vv z uz vz, times the weight.
+    float sums[9][kLanes] = {};
+    const float scale = iteration == 1 ? 6.0f : 2.0f;
+    const float inverse = iteration == 0 ? 0.0f : 1 / (scale * scale);
+    const float px = plane.x(), py = plane.y(), pz = plane.z();
+    const auto add = [&](std::size_t first, std::size_t count) {
+      for (std::size_t k = 0; k < count; ++k) {
+        const float u = samples.x[first + k] - kMiddleX, v = samples.y[first + k] - kMiddleY;
+        const float z = samples.columns[first + k];
+        const float error = z - (px * u + py * v + pz);
+        const float weight = 1 / (1 + error * error * inverse);
+        const float wu = weight * u, wv = weight * v;
+        sums[0][k] += weight;
+        sums[1][k] += wu;
+        sums[2][k] += wv;
+        sums[3][k] += wu * u;
+        sums[4][k] += wu * v;
+        sums[5][k] += wv * v;
+        sums[6][k] += weight * z;
+        sums[7][k] += wu * z;
+        sums[8][k] += wv * z;
+      }
+    };
+    std::size_t first = 0;
+    for (; first + kLanes <= n; first += kLanes) add(first, kLanes);
+    add(first, n - first);
+    float total[9];
+    for (int i = 0; i < 9; ++i) total[i] = std::accumulate(sums[i], sums[i] + kLanes, 0.0f);
+    Eigen::Matrix3f A;
+    A << total[3], total[4], total[1], total[4], total[5], total[2], total[1], total[2], total[0];
     A.diagonal().array() += 1e-3f;
-    plane = A.inverse() * b;
+    plane = A.inverse() * Eigen::Vector3f(total[7], total[8], total[6]);
     if (!plane.allFinite()) return false;
   }
   guess->x = plane.x();
@@ -45,32 +67,36 @@ bool fitPlane(const std::vector<Sample>& samples, int start, Guess* guess) {
   return std::hypot(guess->x, guess->y) <= kSteepest;
 }
 
+/// Samples that are nearer to a plane than that.
+int countNear(const Samples& samples, const Plane& plane, float limit) {
+  const float *x = samples.x.data(), *y = samples.y.data(), *columns = samples.columns.data();
+  const int n = static_cast<int>(samples.size());
+  int near = 0;
+  for (int i = 0; i < n; ++i) near += std::fabs(columns[i] - plane(x[i], y[i])) < limit ? 1 : 0;
+  return near;
+}
+
 /// The plane through three neighbouring samples that most others lie on.
-bool samplePlane(const std::vector<Sample>& samples, int needed, Guess* guess) {
+bool samplePlane(const Samples& samples, int needed, Plane* guess) {
   constexpr int kTrials = 12;
   const std::size_t n = samples.size();
-  const std::size_t stride = std::max<std::size_t>(1, n / 96);
   std::uint32_t random = 12345;
-  int best = 3 * needed / static_cast<int>(stride);
+  int best = 3 * needed;
   bool found = false;
   for (int trial = 0; trial < kTrials; ++trial) {
     random = random * 1664525u + 1013904223u;
-    const std::size_t i = (random >> 8) % n;
-    const Sample &a = samples[i], &b = samples[(i + 3 + trial % 4) % n];
-    const Sample& c = samples[(i + 42 + trial) % n];
-    const float bx = b.x - a.x, by = b.y - a.y, cx = c.x - a.x, cy = c.y - a.y;
+    const std::size_t a = (random >> 8) % n, b = (a + 3 + trial % 4) % n, c = (a + 42 + trial) % n;
+    const float ax = samples.x[a], ay = samples.y[a], az = samples.columns[a];
+    const float bx = samples.x[b] - ax, by = samples.y[b] - ay, bz = samples.columns[b] - az;
+    const float cx = samples.x[c] - ax, cy = samples.y[c] - ay, cz = samples.columns[c] - az;
     const float area = bx * cy - by * cx;
     if (std::fabs(area) < 40) continue;
-    const float bz = b.columns - a.columns, cz = c.columns - a.columns;
-    Guess trial_plane;
+    Plane trial_plane;
     trial_plane.x = (bz * cy - cz * by) / area;
     trial_plane.y = (cz * bx - bz * cx) / area;
     if (std::hypot(trial_plane.x, trial_plane.y) > kSteepest) continue;
-    trial_plane.at = a.columns - trial_plane.x * a.x - trial_plane.y * a.y;
-    int on = 0;
-    for (std::size_t k = 0; k < n; k += stride) {
-      on += std::fabs(samples[k].columns - trial_plane(samples[k].x, samples[k].y)) < 1.5f;
-    }
+    trial_plane.at = az - trial_plane.x * ax - trial_plane.y * ay;
+    const int on = countNear(samples, trial_plane, 1.5f);
     if (on <= best) continue;
     best = on;
     *guess = trial_plane;
@@ -79,24 +105,33 @@ bool samplePlane(const std::vector<Sample>& samples, int needed, Guess* guess) {
   return found;
 }
 
+/// Keeps the samples off a plane. @return how many went
+int removeNear(const Plane& plane, Samples* samples) {
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < samples->size(); ++i) {
+    const float x = samples->x[i], y = samples->y[i], columns = samples->columns[i];
+    samples->x[kept] = x;
+    samples->y[kept] = y;
+    samples->columns[kept] = columns;
+    kept += std::fabs(columns - plane(x, y)) > kOnPlane;
+  }
+  const int gone = static_cast<int>(samples->size() - kept);
+  samples->resize(kept);
+  return gone;
+}
+
 /// The planes that most samples lie on, one after the other.
 void findPlanes(int needed, Scratch* scratch) {
-  std::vector<Sample>& left = scratch->others;
+  Samples& left = scratch->others;
   left = scratch->samples;
-  for (int plane = 0; plane < kMostPlanes; ++plane) {
-    Guess guess;
-    const auto isOff = [&](const Sample& s) {
-      return std::fabs(s.columns - guess(s.x, s.y)) > kOnPlane;
-    };
-    const bool smooth = plane == 0 && fitPlane(left, 1, &guess) &&
-                        std::count_if(left.begin(), left.end(), isOff) * 6 <=
-                            static_cast<std::ptrdiff_t>(left.size());
-    if (!smooth && (!samplePlane(left, needed, &guess) || !fitPlane(left, 3, &guess))) return;
-    const auto end =
-        std::remove_if(left.begin(), left.end(), [&](const Sample& s) { return !isOff(s); });
-    if (left.end() - end < 3 * needed) return;
-    left.erase(end, left.end());
-    scratch->guesses.push_back(guess);
+  for (int found = 0; found < kMostPlanes; ++found) {
+    Plane plane;
+    const int n = static_cast<int>(left.size());
+    const bool smooth = found == 0 && fitPlane(left, 1, &plane) &&
+                        (n - countNear(left, plane, kOnPlane)) * 6 <= n;
+    if (!smooth && (!samplePlane(left, needed, &plane) || !fitPlane(left, 3, &plane))) return;
+    if (removeNear(plane, &left) < 3 * needed) return;
+    scratch->guesses.push_back({plane, {}, {}});
     if (static_cast<int>(left.size()) < 3 * needed) return;
   }
 }
@@ -109,49 +144,56 @@ void guessTile(const cv::Mat* coarse, const Tile& tile, const Band& band, Scratc
   const int least = static_cast<int>(std::floor(tile.h_min * to_columns)) - 1;
   const int most = static_cast<int>(std::ceil(tile.h_max * to_columns)) + 1;
   const cv::Rect whole(0, 0, tile.rect.width, tile.rect.height);
-  guesses.assign(1, {0, 0, 0, {{least, most}}, whole});
+  guesses.assign(1, {{}, {{least, most}}, whole});
   if (!coarse) return;
   constexpr int kAround = 6;
   const int x0 = std::max(tile.rect.x / 2 - kAround, 0);
   const int y0 = std::max(tile.rect.y / 2 - kAround, 0);
   const int x1 = std::min(tile.rect.br().x / 2 + kAround, coarse->cols);
   const int y1 = std::min(tile.rect.br().y / 2 + kAround, coarse->rows);
-  std::vector<Sample>& samples = scratch->samples;
-  samples.clear();
+  Samples& samples = scratch->samples;
+  samples.resize(static_cast<std::size_t>(std::max((y1 - y0) / kSampleStep + 1, 0)) *
+                 std::max((x1 - x0) / kSampleStep + 1, 0));
   int seen = 0;
+  std::size_t found = 0;
   for (int y = y0; y < y1; y += kSampleStep) {
     const float* line = coarse->ptr<float>(y);
     for (int x = x0 + y % 2; x < x1; x += kSampleStep) {
       ++seen;
-      const float columns = line[x] * to_columns;
-      if (columns >= least - 2 && columns <= most + 2)  // neither NaN nor beyond
-        samples.push_back({2 * x + 0.5f - tile.rect.x, 2 * y + 0.5f - tile.rect.y, columns});
+      const float seen_at = line[x] * to_columns;
+      samples.x[found] = 2 * x + 0.5f - tile.rect.x;
+      samples.y[found] = 2 * y + 0.5f - tile.rect.y;
+      samples.columns[found] = seen_at;
+      found += seen_at >= least - 2 && seen_at <= most + 2;  // neither NaN nor beyond
     }
   }
-  if (static_cast<int>(samples.size()) * 8 < seen) return;
+  samples.resize(found);
+  if (static_cast<int>(found) * 8 < seen) return;
   // A few stray pixels do not widen the search; a thin object does.
-  const int needed = std::max(kNeeded, static_cast<int>(samples.size()) / kNeededShare);
+  const int needed = std::max(kNeeded, static_cast<int>(found) / kNeededShare);
   guesses.clear();
   if (most - least > kNarrowLanes) findPlanes(needed, scratch);
 
   // Every sample goes to the plane nearest to it, or to none; these are looked for one and all
   // where they are.
   const std::size_t planes = guesses.size();
-  std::vector<std::uint8_t>& owner = scratch->owner;
-  owner.resize(samples.size());
-  std::size_t strays = 0;
-  for (std::size_t i = 0; i < samples.size(); ++i) {
-    float nearest = kFarOff;
-    owner[i] = static_cast<std::uint8_t>(planes);
-    for (std::size_t p = 0; p < planes; ++p) {
-      const float off = std::fabs(samples[i].columns - guesses[p](samples[i].x, samples[i].y));
-      if (off > nearest) continue;
-      nearest = off;
-      owner[i] = static_cast<std::uint8_t>(p);
+  const float *x = samples.x.data(), *y = samples.y.data(), *columns = samples.columns.data();
+  std::vector<std::int32_t>& owner = scratch->owner;
+  owner.assign(found, static_cast<std::int32_t>(planes));
+  std::vector<float>& nearest = scratch->nearest;
+  nearest.assign(found, kFarOff);
+  for (std::size_t p = 0; p < planes; ++p) {
+    const Plane plane = guesses[p];
+    const auto number = static_cast<std::int32_t>(p);
+    for (std::size_t i = 0; i < found; ++i) {
+      const float off = std::fabs(columns[i] - plane(x[i], y[i]));
+      owner[i] = off <= nearest[i] ? number : owner[i];
+      nearest[i] = std::min(nearest[i], off);
     }
-    strays += owner[i] == planes;
   }
-  if (strays > 0) guesses.push_back({});
+  const bool strays =
+      std::find(owner.begin(), owner.end(), static_cast<std::int32_t>(planes)) != owner.end();
+  if (strays) guesses.push_back({});
   const float right = static_cast<float>(tile.rect.width - 1);
   const float bottom = static_cast<float>(tile.rect.height - 1);
   bool covered = false;
@@ -163,13 +205,20 @@ void guessTile(const cv::Mat* coarse, const Tile& tile, const Band& band, Scratc
     const int to = most - static_cast<int>(std::floor(low));
     std::vector<int>& histogram = scratch->histogram;
     histogram.assign(to - from + 3, 0);
-    const auto bin = [&](const Sample& s) {
-      const float off = s.columns - guess(s.x, s.y);
-      return 1 + std::clamp(static_cast<int>(std::lround(off)), from, to) - from;
-    };
-    for (std::size_t i = 0; i < samples.size(); ++i) {
-      if (owner[i] == p) ++histogram[bin(samples[i])];
+    // The first bin stays empty: it is that of others' samples.
+    std::vector<std::int32_t>& bins = scratch->bins;
+    bins.resize(found);
+    const Plane plane = guess;
+    const auto number = static_cast<std::int32_t>(p);
+    const float first_bin = static_cast<float>(from), last_bin = static_cast<float>(to);
+    for (std::size_t i = 0; i < found; ++i) {
+      const float off = columns[i] - plane(x[i], y[i]);
+      const float held = std::min(std::max(off, first_bin), last_bin);
+      const int bin = 1 + static_cast<int>(held - first_bin + 0.5f);
+      bins[i] = owner[i] == number ? bin : 0;
     }
+    for (const std::int32_t bin : bins) ++histogram[bin];
+    histogram[0] = 0;
     for (int k = from; k <= to; ++k) {
       const int* count = &histogram[1 + k - from];
       if (count[0] == 0 || count[-1] + count[0] + count[1] < needed) continue;
@@ -184,13 +233,14 @@ void guessTile(const cv::Mat* coarse, const Tile& tile, const Band& band, Scratc
     guess.where = whole;
     if (guess.intervals.empty() || !std::exchange(covered, true)) continue;
     float x_min = right, x_max = 0, y_min = bottom, y_max = 0;
-    for (std::size_t i = 0; i < samples.size(); ++i) {
-      const int* count = &histogram[owner[i] == p ? bin(samples[i]) : 1];
-      if (owner[i] != p || count[-1] + count[0] + count[1] < needed) continue;
-      x_min = std::min(x_min, samples[i].x);
-      x_max = std::max(x_max, samples[i].x);
-      y_min = std::min(y_min, samples[i].y);
-      y_max = std::max(y_max, samples[i].y);
+    for (std::size_t i = 0; i < found; ++i) {
+      if (bins[i] == 0) continue;
+      const int* count = &histogram[bins[i]];
+      if (count[-1] + count[0] + count[1] < needed) continue;
+      x_min = std::min(x_min, x[i]);
+      x_max = std::max(x_max, x[i]);
+      y_min = std::min(y_min, y[i]);
+      y_max = std::max(y_max, y[i]);
     }
     const cv::Point corner(static_cast<int>(x_min) - kBeyond, static_cast<int>(y_min) - kBeyond);
     const cv::Point end(static_cast<int>(x_max) + kBeyond, static_cast<int>(y_max) + kBeyond);
@@ -201,7 +251,7 @@ void guessTile(const cv::Mat* coarse, const Tile& tile, const Band& band, Scratc
                                  return guess.intervals.empty() || guess.where.empty();
                                }),
                 guesses.end());
-  if (guesses.empty()) guesses.push_back({0, 0, 0, {{least, most}}, whole});
+  if (guesses.empty()) guesses.push_back({{}, {{least, most}}, whole});
 }
 
 }  // namespace omnister::sweep

@@ -24,19 +24,27 @@ struct Level {
   cv::Mat h;      ///< CV_32FC1, hypotheses found
 };
 
-/// A surface that the next coarser level saw in a tile: a plane of hypotheses, and how far from it
-/// to look. All in columns; the plane by pixels from the tile's corner.
-struct Guess {
+/// Hypotheses [columns] over a tile, by pixels from its corner.
+struct Plane {
   float at = 0, x = 0, y = 0;
-  std::vector<std::pair<int, int>> intervals;
-  cv::Rect where;  ///< part of the tile that it was seen in
 
   float operator()(float u, float v) const { return at + x * u + y * v; }
 };
 
-/// A pixel of the coarser level: where it is in the tile, and its hypothesis in columns.
-struct Sample {
-  float x, y, columns;
+/// A surface that the next coarser level saw in a tile, and how far from it to look [columns].
+struct Guess : Plane {
+  std::vector<std::pair<int, int>> intervals;
+  cv::Rect where;  ///< part of the tile that it was seen in
+};
+
+/// Pixels of the coarser level: where they are in the tile, and their hypotheses in columns.
+struct Samples {
+  std::vector<float> x, y, columns;
+
+  std::size_t size() const { return columns.size(); }
+  void resize(std::size_t size) {
+    for (std::vector<float>* all : {&x, &y, &columns}) all->resize(size);
+  }
 };
 
 /// What a thread keeps between tiles.
@@ -49,8 +57,9 @@ struct Scratch {
   std::vector<std::uint16_t> cost, before, after;
   std::vector<std::int16_t> index;
   std::vector<int> histogram;
-  std::vector<Sample> samples, others;
-  std::vector<std::uint8_t> owner;
+  Samples samples, others;
+  std::vector<float> nearest;
+  std::vector<std::int32_t> owner, bins;
   std::vector<Guess> guesses;
   // Of the passes before, and one row of this one.
   std::vector<std::uint16_t> best_cost, row_steep;
