@@ -5,6 +5,7 @@
 #include <atomic>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "omnister/common/parallel.h"
 #include "sweep_filters.h"
@@ -148,26 +149,28 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
   MapView map;
   sigma->release();
   if (job.coarse.empty()) return 0;
-  // A look at every sixteenth pixel tells whether there is anything to do.
-  std::size_t field = 0, open = 0;
+  // A look at every sixteenth pixel tells whether there is anything to do. Most have a match, or lie
+  // where no level has one: the map is made for few rows.
+  std::size_t open = 0;
   for (int y = 2; y < height; y += 4) {
     const float* line = h->ptr<float>(y);
-    viewRow(*job.map, y, &map);
+    bool viewed = false;
     for (int x = 2; x < width; x += 4) {
-      if (!hasRay(map, x)) continue;
-      ++field;
-      if (!std::isnan(line[x]) || !isWeak(job.reference, x, y)) continue;
-      for (std::size_t l = 0; l < job.coarse.size(); ++l) {
-        const cv::Mat& coarse = *job.coarse[l].h;
-        if (std::isnan(coarse.at<float>(std::min(y >> (l + 1), coarse.rows - 1),
-                                        std::min(x >> (l + 1), coarse.cols - 1))))
-          continue;
-        ++open;
-        break;
-      }
+      if (!std::isnan(line[x])) continue;
+      const bool seen = std::any_of(
+          job.coarse.begin(), job.coarse.end(), [&, level = 1](const CoarseLevel& coarse) mutable {
+            const int v = std::min(y >> level, coarse.h->rows - 1);
+            const int u = std::min(x >> level, coarse.h->cols - 1);
+            ++level;
+            return !std::isnan(coarse.h->at<float>(v, u));
+          });
+      if (!seen || !isWeak(job.reference, x, y)) continue;
+      if (!std::exchange(viewed, true)) viewRow(*job.map, y, &map);
+      open += hasRay(map, x);
     }
   }
-  if (static_cast<float>(open) < kLeastShare * static_cast<float>(field)) return 0;
+  const float field = static_cast<float>(job.map->field) / 16;
+  if (static_cast<float>(open) < kLeastShare * field) return 0;
 
   // Surfaces of the half image, from the finest level that has one.
   std::vector<cv::Mat> surfaces;

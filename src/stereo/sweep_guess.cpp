@@ -18,6 +18,7 @@ constexpr int kSampleStep = 3;                  ///< pixels of the coarser level
 constexpr int kNeeded = 3, kNeededShare = 150;  ///< samples that make the search go somewhere
 constexpr float kOnPlane = 3.4f;                ///< columns off a plane that still belong to it,
 constexpr float kFarOff = 16;                   ///< or are looked for from it
+constexpr int kLeastWidth = 16;                 ///< pixels, of what is searched at once
 constexpr int kBeyond = 8;                      ///< pixels around where a plane was seen
 constexpr float kSteepest = 1.2f;               ///< columns a pixel that a plane may rise
 
@@ -245,6 +246,12 @@ void guessTile(const cv::Mat* coarse, const Tile& tile, const Band& band, Scratc
     const cv::Point corner(static_cast<int>(x_min) - kBeyond, static_cast<int>(y_min) - kBeyond);
     const cv::Point end(static_cast<int>(x_max) + kBeyond, static_cast<int>(y_max) + kBeyond);
     guess.where &= cv::Rect(corner, end);
+    // No narrower than the widest vector, which must not reach into another tile.
+    const int lacking = std::min(kLeastWidth, whole.width) - guess.where.width;
+    if (lacking > 0) {
+      guess.where.x = std::max(guess.where.x - lacking, 0);
+      guess.where.width += lacking;
+    }
   }
   guesses.erase(std::remove_if(guesses.begin(), guesses.end(),
                                [](const Guess& guess) {

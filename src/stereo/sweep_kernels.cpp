@@ -289,7 +289,7 @@ void CensusWide(const std::uint16_t* pairs, int pairs_stride, int width, int hei
 void CensusBlock(const std::uint16_t* pairs, int pairs_stride, int width, int height,
                  const CensusOffsets& offsets, bool narrow, std::uint8_t* const out[kPlanes],
                  int stride) {
-  if (narrow)
+  if (narrow || width <= 16)
     CensusWide<16>(pairs, pairs_stride, width, height, offsets, out, stride);
   else
     CensusWide<32>(pairs, pairs_stride, width, height, offsets, out, stride);

@@ -152,6 +152,11 @@ struct ConcludeJob {
   /// Costs near the least are a parabola. `steep` is then what gives TriangulateJob the spread of
   /// such a least: it goes with the root of the rise.
   bool parabola = false;
+  /// Whether something was concluded before: pixels change where this costs less.
+  bool merge = false;
+  /// [in] when merging, and [out]: the least cost. Where `count` is less than 16, as many elements
+  /// are written here and below all the same.
+  std::uint16_t* best = nullptr;
   float* h = nullptr;              ///< [out] NaN where nothing was found
   std::uint16_t* steep = nullptr;  ///< [out] rise of cost to the higher neighbour; may be null
   // Where the match falls on the claims image; skipped when claim is null.

@@ -61,10 +61,7 @@ struct Scratch {
   std::vector<float> nearest;
   std::vector<std::int32_t> owner, bins;
   std::vector<Guess> guesses;
-  // Of the passes before, and one row of this one.
-  std::vector<std::uint16_t> best_cost, row_steep;
-  std::vector<float> row_h;
-  std::vector<std::int32_t> row_claim;
+  std::vector<std::uint16_t> best_cost;  ///< of the passes before
   std::vector<std::int32_t> claims;     ///< of this thread's tiles
   std::vector<float> rows[3], nothing;  ///< between two filters
 };

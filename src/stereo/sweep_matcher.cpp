@@ -363,13 +363,11 @@ class SweepMatcher : public SweepPair {
     boxColumns(&scratch->residual[static_cast<std::size_t>(guess.where.y) * stride + guess.where.x],
                stride, where.width + 2 * kRadius, where.height, scratch->residual_sums.data());
     scratch->residual_mean.resize(stride + 64);
-    if (merge) {
-      scratch->row_h.resize(stride + 64);
-      scratch->row_steep.resize(stride + 64);
-      scratch->row_claim.resize(stride + 64);
-    } else {
-      scratch->best_cost.resize(tile.rect.area());
-    }
+    // The finest level's costs are kept, in whole bits.
+    const int shift = compare_.shift();
+    const bool keeps_cost = l == 0 && shift == 0;
+    const int best_stride = (tile.rect.width + 15) / 16 * 16;
+    scratch->best_cost.resize(static_cast<std::size_t>(best_stride) * tile.rect.height);
     const std::size_t h_step = level.h.step1(), claim_step = claim_.step1();
     ConcludeJob job;
     job.count = where.width;
@@ -378,7 +376,7 @@ class SweepMatcher : public SweepPair {
     job.cells = level.grid.cells;
     job.step_h = static_cast<float>(band.step_h);
     job.guess_x = guess.x;
-    const int shift = compare_.shift();
+    job.merge = merge;
     job.worst_cost = kWorstShare * kFullCost * static_cast<float>(1 << shift);
     job.parabola = compare_.isParabola();
     job.claim_x = claim_x_;
@@ -401,48 +399,26 @@ class SweepMatcher : public SweepPair {
       job.phi = &scratch->view.phi[pixel];
       job.a = &scratch->view.a[pixel];
       job.guess = guess(static_cast<float>(guess.where.x), static_cast<float>(guess.where.y + y));
-      std::uint16_t* best =
-          &scratch->best_cost[static_cast<std::size_t>(guess.where.y + y) * tile.rect.width +
+      job.best =
+          &scratch->best_cost[static_cast<std::size_t>(guess.where.y + y) * best_stride +
                               guess.where.x];
-      float* h = level.h.ptr<float>(where.y + y) + where.x;
-      std::uint16_t *steep = nullptr, *cost = nullptr;
-      std::int32_t* claim = nullptr;
+      job.h = level.h.ptr<float>(where.y + y) + where.x;
+      std::uint16_t* cost = nullptr;
       if (l == 0) {
         cost = cost_.ptr<std::uint16_t>(where.y + y) + where.x;
-        steep = steep_.ptr<std::uint16_t>(where.y + y) + where.x;
-        claim = claim_.ptr<std::int32_t>(where.y + y) + where.x;
+        if (keeps_cost) job.best = cost;
+        job.steep = steep_.ptr<std::uint16_t>(where.y + y) + where.x;
+        job.claim = claim_.ptr<std::int32_t>(where.y + y) + where.x;
       }
       if (y + 2 < where.height) {
         for (int x = 0; x < where.width; x += 16) {
-          __builtin_prefetch(h + 2 * h_step + x, 1);
-          if (l == 0) __builtin_prefetch(claim + 2 * claim_step + x, 1);
+          __builtin_prefetch(job.h + 2 * h_step + x, 1);
+          if (l == 0) __builtin_prefetch(job.claim + 2 * claim_step + x, 1);
         }
-      }
-      job.h = merge ? scratch->row_h.data() : h;
-      if (l == 0) {
-        job.steep = merge ? scratch->row_steep.data() : steep;
-        job.claim = merge ? scratch->row_claim.data() : claim;
       }
       concludeRow(&job);
-      if (!merge) {
-        std::copy_n(job.cost, where.width, best);
-        if (l == 0)
-          for (int x = 0; x < where.width; ++x) cost[x] = job.cost[x] >> shift;
-        // Vectors wrote past the end of the row.
-        if (where.br().x == level.h.cols) std::fill_n(h + where.width, 16, kNaN);
-        continue;
-      }
-      // Without branches, so that these become vectors.
-      for (int x = 0; x < where.width; ++x) h[x] = job.cost[x] < best[x] ? job.h[x] : h[x];
-      if (l == 0) {
-        for (int x = 0; x < where.width; ++x) {
-          steep[x] = job.cost[x] < best[x] ? job.steep[x] : steep[x];
-          cost[x] = std::min<std::uint16_t>(cost[x], job.cost[x] >> shift);
-        }
-        for (int x = 0; x < where.width; ++x)
-          claim[x] = job.cost[x] < best[x] ? job.claim[x] : claim[x];
-      }
-      for (int x = 0; x < where.width; ++x) best[x] = std::min(best[x], job.cost[x]);
+      if (l == 0 && !keeps_cost)
+        for (int x = 0; x < where.width; ++x) cost[x] = job.best[x] >> shift;
     }
   }
 

@@ -28,13 +28,22 @@ void ConcludeRow(ConcludeJob* in_out) {
     return hn::ConvertTo(df, hn::PromoteTo(di, hn::LoadU(du16, p)));
   };
   HWY_ALIGN std::int32_t words[HWY_MAX_BYTES / 4];
-  for (int x = 0; x < job.count; x += lanes) {
+  for (int begin = 0; begin < job.count; begin += lanes) {
+    // The last vector ends where the row does: behind it lie pixels of others.
+    const int x = std::max(std::min(begin, job.count - lanes), 0);
+    const auto own = hn::LoadU(du16, job.cost + x);
+    auto lower = hn::FirstN(du16, lanes);
+    if (job.merge) {
+      lower = hn::Lt(own, hn::LoadU(du16, job.best + x));
+      if (hn::AllFalse(du16, lower)) continue;
+    }
     const auto c = load(job.cost + x), before = load(job.before + x), after = load(job.after + x);
     const auto k = hn::PromoteTo(di, hn::LoadU(di16, job.index + x));
     const auto steep = hn::Sub(hn::Max(before, after), c);
     const auto cell = hn::Add(hn::LoadU(di, job.base + x), k);
     const auto phi = hn::PromoteTo(di, hn::LoadU(du16, job.phi + x));
-    auto good = hn::Ne(phi, hn::Set(di, kNoRay));
+    auto good =
+        hn::And(hn::Ne(phi, hn::Set(di, kNoRay)), hn::Lt(Count(di, x), hn::Set(di, job.count)));
     if (job.mask) {
       const auto legal =
           hn::And(hn::Gt(cell, hn::Set(di, -1)), hn::Lt(cell, hn::Set(di, job.cells)));
@@ -60,12 +69,17 @@ void ConcludeRow(ConcludeJob* in_out) {
     const auto columns =
         hn::Add(hn::Add(hn::ConvertTo(df, k), shift), hn::LoadU(df, job.residual + x));
     const auto h = hn::Mul(hn::Add(columns, guess), hn::Set(df, job.step_h));
-    hn::StoreU(hn::IfThenElse(fine, h, hn::NaN(df)), df, job.h + x);
+    const auto change = hn::Lt(c, job.merge ? load(job.best + x) : hn::Inf(df));
+    const auto put = [&](auto d, auto where, auto value, auto* to) {
+      hn::StoreU(job.merge ? hn::IfThenElse(where, value, hn::LoadU(d, to)) : value, d, to);
+    };
+    put(df, change, hn::IfThenElse(fine, h, hn::NaN(df)), job.h + x);
     if (job.steep) {
       auto rise = hn::Max(steep, hn::Zero(df));
       if (job.parabola) rise = hn::Mul(hn::Sqrt(rise), hn::Set(df, kSteepOfParabola));
-      hn::StoreU(hn::DemoteTo(du16, hn::ConvertTo(di, rise)), du16, job.steep + x);
+      put(du16, lower, hn::DemoteTo(du16, hn::ConvertTo(di, rise)), job.steep + x);
     }
+    put(du16, lower, own, job.best + x);
     if (job.claim) {
       const auto theta = hn::Add(hn::LoadU(df, job.a + x), h);
       const auto angle =
@@ -78,9 +92,8 @@ void ConcludeRow(ConcludeJob* in_out) {
       const auto column = hn::Min(hn::Max(u, hn::Zero(di)), hn::Set(di, job.claim_width - 1));
       const auto row = hn::Min(hn::Max(v, hn::Zero(di)), hn::Set(di, job.claim_height - 1));
       const auto at = hn::Add(hn::Mul(row, hn::Set(di, job.claim_width)), column);
-      const auto counted =
-          hn::And(hn::RebindMask(di, fine), hn::Lt(Count(di, x), hn::Set(di, job.count)));
-      hn::StoreU(hn::IfThenElse(counted, at, hn::Set(di, -1)), di, job.claim + x);
+      put(di, hn::RebindMask(di, change),
+          hn::IfThenElse(hn::RebindMask(di, fine), at, hn::Set(di, -1)), job.claim + x);
     }
   }
 }
@@ -112,10 +125,13 @@ void ClaimRow(const ClaimJob& job) {
     const auto cost = hn::PromoteTo(di, hn::LoadU(du16, job.cost + x));
     hn::Store(element, di, at);
     hn::Store(hn::Or(hn::ShiftLeft<16>(cost), units), di, value);
-    for (int i = 0; i < lanes; ++i) {
-      // The lesser of two that are not negative, without a branch that half would take wrongly.
-      const std::int32_t less = value[i] - claims[at[i]];
-      claims[at[i]] += less & (less >> 31);
+    // Neighbours often claim the same: between them come others, so that none waits.
+    for (const int first : {0, 1}) {
+      for (int i = first; i < lanes; i += 2) {
+        // The lesser of two that are not negative, without a branch that half would take wrongly.
+        const std::int32_t less = value[i] - claims[at[i]];
+        claims[at[i]] += less & (less >> 31);
+      }
     }
   }
 }
