@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <numeric>
 
 #include "sweep_level.h"
 
@@ -24,42 +23,47 @@ constexpr float kSteepest = 1.2f;               ///< columns a pixel that a plan
 
 /// Least squares, reweighted. @param rounds 1: from scratch; 3: only refined
 bool fitPlane(const Samples& samples, int start, Plane* guess) {
-  constexpr std::size_t kLanes = 4;  // sums side by side, which makes them vectors
-  const std::size_t n = samples.size();
+  using Lanes = Eigen::Array4f;
+  constexpr std::size_t kLanes = 4;
+  const std::size_t n = samples.size(), whole = n / kLanes * kLanes;
+  // Those that fill no vector, and how many count.
+  Lanes last[3] = {Lanes::Zero(), Lanes::Zero(), Lanes::Zero()}, counted = Lanes::Zero();
+  for (std::size_t i = whole; i < n; ++i) {
+    const auto k = static_cast<Eigen::Index>(i - whole);
+    last[0][k] = samples.x[i];
+    last[1][k] = samples.y[i];
+    last[2][k] = samples.columns[i];
+    counted[k] = 1;
+  }
   Eigen::Vector3f plane((*guess).x, (*guess).y, (*guess)(kMiddleX, kMiddleY));
   for (int iteration = start - 1; iteration < 4; ++iteration) {
-    // Of 1 u v uu uv vv z uz vz, times the weight.
-    float sums[9][kLanes] = {};
+    Lanes w = Lanes::Zero(), u = w, v = w, uu = w, uv = w, vv = w, z = w, uz = w, vz = w;
     const float scale = iteration == 1 ? 6.0f : 2.0f;
     const float inverse = iteration == 0 ? 0.0f : 1 / (scale * scale);
-    const float px = plane.x(), py = plane.y(), pz = plane.z();
-    const auto add = [&](std::size_t first, std::size_t count) {
-      for (std::size_t k = 0; k < count; ++k) {
-        const float u = samples.x[first + k] - kMiddleX, v = samples.y[first + k] - kMiddleY;
-        const float z = samples.columns[first + k];
-        const float error = z - (px * u + py * v + pz);
-        const float weight = 1 / (1 + error * error * inverse);
-        const float wu = weight * u, wv = weight * v;
-        sums[0][k] += weight;
-        sums[1][k] += wu;
-        sums[2][k] += wv;
-        sums[3][k] += wu * u;
-        sums[4][k] += wu * v;
-        sums[5][k] += wv * v;
-        sums[6][k] += weight * z;
-        sums[7][k] += wu * z;
-        sums[8][k] += wv * z;
-      }
+    const auto add = [&](const Lanes& x, const Lanes& y, const Lanes& columns, const Lanes& most) {
+      const Lanes du = x - kMiddleX, dv = y - kMiddleY;
+      const Lanes error = columns - (plane.x() * du + plane.y() * dv + plane.z());
+      const Lanes weight = most / (1 + error * error * inverse);
+      const Lanes wu = weight * du, wv = weight * dv;
+      w += weight;
+      u += wu;
+      v += wv;
+      uu += wu * du;
+      uv += wu * dv;
+      vv += wv * dv;
+      z += weight * columns;
+      uz += wu * columns;
+      vz += wv * columns;
     };
-    std::size_t first = 0;
-    for (; first + kLanes <= n; first += kLanes) add(first, kLanes);
-    add(first, n - first);
-    float total[9];
-    for (int i = 0; i < 9; ++i) total[i] = std::accumulate(sums[i], sums[i] + kLanes, 0.0f);
+    for (std::size_t i = 0; i < whole; i += kLanes) {
+      add(Lanes::Map(&samples.x[i]), Lanes::Map(&samples.y[i]), Lanes::Map(&samples.columns[i]),
+          Lanes::Ones());
+    }
+    if (whole < n) add(last[0], last[1], last[2], counted);
     Eigen::Matrix3f A;
-    A << total[3], total[4], total[1], total[4], total[5], total[2], total[1], total[2], total[0];
+    A << uu.sum(), uv.sum(), u.sum(), uv.sum(), vv.sum(), v.sum(), u.sum(), v.sum(), w.sum();
     A.diagonal().array() += 1e-3f;
-    plane = A.inverse() * Eigen::Vector3f(total[7], total[8], total[6]);
+    plane = A.inverse() * Eigen::Vector3f(uz.sum(), vz.sum(), z.sum());
     if (!plane.allFinite()) return false;
   }
   guess->x = plane.x();
