@@ -149,21 +149,21 @@ std::size_t WeakFill::fill(const Job& job, cv::Mat* h, cv::Mat* sigma) {
   MapView map;
   sigma->release();
   if (job.coarse.empty()) return 0;
-  // A look at every sixteenth pixel tells whether there is anything to do. Most have a match, or lie
-  // where no level has one: the map is made for few rows.
+  // A look at every sixteenth pixel tells whether there is anything to do. Most have a match, or
+  // lie where no level has one: the map is made for few rows.
   std::size_t open = 0;
   for (int y = 2; y < height; y += 4) {
     const float* line = h->ptr<float>(y);
     bool viewed = false;
     for (int x = 2; x < width; x += 4) {
       if (!std::isnan(line[x])) continue;
-      const bool seen = std::any_of(
-          job.coarse.begin(), job.coarse.end(), [&, level = 1](const CoarseLevel& coarse) mutable {
-            const int v = std::min(y >> level, coarse.h->rows - 1);
-            const int u = std::min(x >> level, coarse.h->cols - 1);
-            ++level;
-            return !std::isnan(coarse.h->at<float>(v, u));
-          });
+      const bool seen = std::any_of(job.coarse.begin(), job.coarse.end(),
+                                    [&, level = 1](const CoarseLevel& coarse) mutable {
+                                      const int v = std::min(y >> level, coarse.h->rows - 1);
+                                      const int u = std::min(x >> level, coarse.h->cols - 1);
+                                      ++level;
+                                      return !std::isnan(coarse.h->at<float>(v, u));
+                                    });
       if (!seen || !isWeak(job.reference, x, y)) continue;
       if (!std::exchange(viewed, true)) viewRow(*job.map, y, &map);
       open += hasRay(map, x);

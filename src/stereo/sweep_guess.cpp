@@ -132,8 +132,8 @@ void findPlanes(int needed, Scratch* scratch) {
   for (int found = 0; found < kMostPlanes; ++found) {
     Plane plane;
     const int n = static_cast<int>(left.size());
-    const bool smooth = found == 0 && fitPlane(left, 1, &plane) &&
-                        (n - countNear(left, plane, kOnPlane)) * 6 <= n;
+    const bool smooth =
+        found == 0 && fitPlane(left, 1, &plane) && (n - countNear(left, plane, kOnPlane)) * 6 <= n;
     if (!smooth && (!samplePlane(left, needed, &plane) || !fitPlane(left, 3, &plane))) return;
     if (removeNear(plane, &left) < 3 * needed) return;
     scratch->guesses.push_back({plane, {}, {}});

@@ -197,9 +197,14 @@ struct RejectJob {
 /// reach of windows across it.
 void rejectRow(RejectJob* job);
 
-/// Median of 3x3 where the middle is valid, neighbours that are not counting as the middle.
-/// @param rows above, here, below; one element before and behind must be readable
-void medianRow(const float* const rows[3], int count, float* out);
+/// Rows that averageRow() looks at. Errors of neighbours are alike, for they share most of their
+/// windows; those of pixels half as far away as a window is wide much less so.
+inline constexpr int kAverageRows = 7;
+/// Where the middle is valid: the median of 3x3, neighbours that are not valid counting as the
+/// middle, averaged with those of the eight pixels three rows or columns away that are within
+/// `near` of it.
+/// @param rows three above, here, three below; three elements before and behind must be readable
+void averageRow(const float* const rows[kAverageRows], int count, float near, float* out);
 
 /// Spread of a hypothesis [columns] times the slope of its cost over the root of the cost; as
 /// measured on rendered scenes with image noise of one grey level.

@@ -61,9 +61,9 @@ struct Scratch {
   std::vector<float> nearest;
   std::vector<std::int32_t> owner, bins;
   std::vector<Guess> guesses;
-  std::vector<std::uint16_t> best_cost;  ///< of the passes before
-  std::vector<std::int32_t> claims;     ///< of this thread's tiles
-  std::vector<float> rows[3], nothing;  ///< between two filters
+  std::vector<std::uint16_t> best_cost;            ///< of the passes before
+  std::vector<std::int32_t> claims;                ///< of this thread's tiles
+  std::vector<float> rows[kAverageRows], nothing;  ///< between two filters
 };
 
 class CostFunction;

@@ -37,7 +37,8 @@ constexpr float kClaimUnits = 4;     ///< of a column, in which claims are compa
 constexpr int kClaimTolerance = 7;   ///< so many of these two may differ by
 constexpr float kClaimScale = 0.5f;  ///< spots a column of the claims image
 constexpr std::int32_t kUnclaimed = std::numeric_limits<std::int32_t>::max();
-constexpr float kEdgeJump = 1.5f;         ///< columns between surfaces at an edge
+constexpr float kEdgeJump = 1.5f;         ///< columns between surfaces at an edge,
+constexpr float kSameSurface = 1.5f;      ///< and on one, at most
 constexpr int kSpeckle = 100;             ///< regions of fewer pixels go,
 constexpr int kSpeckleShare = 3000;       ///< or of less than this part of the image
 constexpr float kMatchedVariance = 6.0f;  ///< of matches in weak texture, times what costs say
@@ -399,9 +400,8 @@ class SweepMatcher : public SweepPair {
       job.phi = &scratch->view.phi[pixel];
       job.a = &scratch->view.a[pixel];
       job.guess = guess(static_cast<float>(guess.where.x), static_cast<float>(guess.where.y + y));
-      job.best =
-          &scratch->best_cost[static_cast<std::size_t>(guess.where.y + y) * best_stride +
-                              guess.where.x];
+      job.best = &scratch->best_cost[static_cast<std::size_t>(guess.where.y + y) * best_stride +
+                                     guess.where.x];
       job.h = level.h.ptr<float>(where.y + y) + where.x;
       std::uint16_t* cost = nullptr;
       if (l == 0) {
@@ -469,7 +469,7 @@ class SweepMatcher : public SweepPair {
               Stopwatch* watch) {
     Level& level = levels_.front();
     const int width = level.map.size.width, height = level.map.size.height;
-    constexpr int kStrip = 32;
+    constexpr int kStrip = 48;
     const int strips = (height + kStrip - 1) / kStrip;
     const auto forRows = [&](const auto& body) {
       parallelFor(0, strips, options_.threads, [&](std::size_t s) {
@@ -507,7 +507,7 @@ class SweepMatcher : public SweepPair {
       job.tolerance = kClaimTolerance;
       job.jump = kEdgeJump * finest_step_;
       const auto reject = [&](int y) {
-        job.out = scratch.rows[(y + 3) % 3].data() + 16;
+        job.out = scratch.rows[(y + kAverageRows) % kAverageRows].data() + 16;
         if (y < 0 || y >= height) {
           std::fill(job.out, job.out + width, kNaN);
           return;
@@ -527,13 +527,14 @@ class SweepMatcher : public SweepPair {
         if (y < begin || y >= end) job = before;
         std::fill_n(job.out + width, 32, kNaN);
       };
-      reject(begin - 1);
-      reject(begin);
+      constexpr int kReach = kAverageRows / 2;
+      for (int y = begin - kReach; y < begin + kReach; ++y) reject(y);
       for (int y = begin; y < end; ++y) {
-        reject(y + 1);
-        const float* rows[3];
-        for (int k = 0; k < 3; ++k) rows[k] = scratch.rows[(y + k + 2) % 3].data() + 16;
-        medianRow(rows, width, smooth.ptr<float>(y));
+        reject(y + kReach);
+        const float* rows[kAverageRows];
+        for (int k = 0; k < kAverageRows; ++k)
+          rows[k] = scratch.rows[(y + k + kAverageRows - kReach) % kAverageRows].data() + 16;
+        averageRow(rows, width, kSameSurface * finest_step_, smooth.ptr<float>(y));
       }
     });
     std::size_t found = 0, lost = 0, edge = 0;

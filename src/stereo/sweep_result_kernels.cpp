@@ -204,22 +204,24 @@ HWY_INLINE void StoreFront(D d, hn::Vec<D> v, float* to, int count) {
   }
 }
 
-void MedianRow(const float* const rows[3], int count, float* HWY_RESTRICT out) {
+void AverageRow(const float* const rows[kAverageRows], int count, float near,
+                float* HWY_RESTRICT out) {
+  constexpr int kReach = kAverageRows / 2;
   const hn::ScalableTag<float> d;
   const int lanes = static_cast<int>(hn::Lanes(d));
   for (int x = 0; x < count; x += lanes) {
-    const auto middle = hn::LoadU(d, rows[1] + x);
+    const auto middle = hn::LoadU(d, rows[kReach] + x);
     if (hn::AllTrue(d, hn::IsNaN(middle))) {
       StoreFront(d, middle, out + x, count - x);
       continue;
     }
-    const auto load = [&](int row, int dx) {
-      const auto v = hn::LoadU(d, rows[row] + x + dx);
+    const auto load = [&](int dx, int dy) {
+      const auto v = hn::LoadU(d, rows[kReach + dy] + x + dx);
       return hn::IfThenElse(hn::IsNaN(v), middle, v);
     };
-    auto a = load(0, -1), b = load(0, 0), c = load(0, 1);
-    auto e = load(1, -1), f = middle, g = load(1, 1);
-    auto i = load(2, -1), j = load(2, 0), k = load(2, 1);
+    auto a = load(-1, -1), b = load(0, -1), c = load(1, -1);
+    auto e = load(-1, 0), f = middle, g = load(1, 0);
+    auto i = load(-1, 1), j = load(0, 1), k = load(1, 1);
     const auto sort = [](auto& p, auto& q) {
       const auto low = hn::Min(p, q);
       q = hn::Max(p, q);
@@ -243,6 +245,18 @@ void MedianRow(const float* const rows[3], int count, float* HWY_RESTRICT out) {
     sort(f, c);
     f = hn::Max(i, f);
     f = hn::Min(f, c);
+    auto sum = hn::Zero(d), number = hn::Set(d, 1.0f);
+    for (int dy = -kReach; dy <= kReach; dy += kReach) {
+      for (int dx = -kReach; dx <= kReach; dx += kReach) {
+        if (dx == 0 && dy == 0) continue;
+        // Comparisons with NaN are false.
+        const auto apart = hn::Sub(hn::LoadU(d, rows[kReach + dy] + x + dx), f);
+        const auto close = hn::Le(hn::Abs(apart), hn::Set(d, near));
+        sum = hn::Add(sum, hn::IfThenElseZero(close, apart));
+        number = hn::Add(number, hn::IfThenElseZero(close, hn::Set(d, 1.0f)));
+      }
+    }
+    f = hn::Add(f, hn::Div(sum, number));
     StoreFront(d, hn::IfThenElse(hn::IsNaN(middle), middle, f), out + x, count - x);
   }
 }
@@ -322,7 +336,7 @@ namespace omnister::sweep {
 HWY_EXPORT(ConcludeRow);
 HWY_EXPORT(ClaimRow);
 HWY_EXPORT(RejectRow);
-HWY_EXPORT(MedianRow);
+HWY_EXPORT(AverageRow);
 HWY_EXPORT(TriangulateRow);
 
 void concludeRow(ConcludeJob* job) { HWY_DYNAMIC_DISPATCH(ConcludeRow)(job); }
@@ -331,8 +345,8 @@ void claimRow(const ClaimJob& job) { HWY_DYNAMIC_DISPATCH(ClaimRow)(job); }
 
 void rejectRow(RejectJob* job) { HWY_DYNAMIC_DISPATCH(RejectRow)(job); }
 
-void medianRow(const float* const rows[3], int count, float* out) {
-  HWY_DYNAMIC_DISPATCH(MedianRow)(rows, count, out);
+void averageRow(const float* const rows[kAverageRows], int count, float near, float* out) {
+  HWY_DYNAMIC_DISPATCH(AverageRow)(rows, count, near, out);
 }
 
 void triangulateRow(TriangulateJob* job) { HWY_DYNAMIC_DISPATCH(TriangulateRow)(job); }
