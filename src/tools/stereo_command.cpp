@@ -485,7 +485,7 @@ void addStereo(CLI::App& app) {
           ->check(CLI::IsMember(presets));
   CLI::Option* refine = command->add_flag(
       "--refine", arguments->options.refine,
-      "Let grey values have the last word on a pair's ranges: half the error for a few "
+      "Let grey values have the last word on a pair's ranges: a quarter less error for a few "
       "times the time; several displaced images always are refined");
   command->add_option("--threads", arguments->options.threads, "Threads; 0: every core")
       ->check(CLI::Range(0, 1024))
