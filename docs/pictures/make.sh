@@ -34,15 +34,19 @@ cat >"$work/pictures.launch" <<XML
     <arg name="store" value="$work/store"/>
     <arg name="port" value="$work/stage"/>
   </include>
-  <include file="$share/launch/rviz.launch"><arg name="max_m" value="0.4"/></include>
+  <include file="$share/launch/rviz.launch"><arg name="handle" value="false"/></include>
 </launch>
 XML
 roslaunch -p "$port" "$work/pictures.launch" >"$work/roslaunch.log" 2>&1 &
 pids+=($!)
-until rostopic list >/dev/null 2>&1; do sleep 0.5; done
+until rostopic list >/dev/null 2>&1; do
+  kill -0 "${pids[-1]}" 2>/dev/null || { tail -n 5 "$work/roslaunch.log" >&2; exit 1; }
+  sleep 0.5
+done
 cat >"$work/take.py" <<'PY'
 import sys
 import numpy
+import rosgraph
 import rospy
 from omnister.msg import MoveStageActionGoal, MoveStageActionResult, MoveStageGoal, StageState
 from sensor_msgs.msg import Image, PointCloud2
@@ -57,20 +61,27 @@ while not rospy.wait_for_message('/stage/stage_state', StageState, 60).homed:
 goals = rospy.Publisher('/stage/move_stage/goal', MoveStageActionGoal, queue_size=1)
 while goals.get_num_connections() == 0:
     rospy.sleep(0.1)
-for position in (0.1, 0.3):
-    goals.publish(MoveStageActionGoal(goal=MoveStageGoal(position=position)))
-    rospy.wait_for_message('/stage/move_stage/result', MoveStageActionResult, 60)
-    rospy.sleep(3.0)
-rospy.wait_for_message('/camera/points2', PointCloud2, 120)
-image = rospy.wait_for_message('/camera/epipolar', Image, 120)
+# rviz starts when it can; pairs are made of what was seen while somebody listened.
+master = rosgraph.Master('/pictures')
+while not any('/rviz' in nodes for topic, nodes in master.getSystemState()[1] if topic == '/camera/points2'):
+    rospy.sleep(0.5)
+clouds, pictures = [], []
+rospy.Subscriber('/camera/points2', PointCloud2, clouds.append, queue_size=1, buff_size=1 << 25)
+rospy.Subscriber('/camera/epipolar', Image, pictures.append, queue_size=1, buff_size=1 << 25)
+while len(clouds) < 4 or not pictures:
+    for position in (0.1, 0.3):
+        goals.publish(MoveStageActionGoal(goal=MoveStageGoal(position=position)))
+        rospy.wait_for_message('/stage/move_stage/result', MoveStageActionResult, 60)
+        rospy.sleep(4.0)
+image = pictures[-1]
 pixels = numpy.frombuffer(image.data, numpy.uint8).reshape(image.height, image.width, 3)[:, :, ::-1]
 with open(sys.argv[1], 'wb') as file:
     file.write(b'P6 %d %d 255\n' % (image.width, image.height) + pixels.tobytes())
-rospy.sleep(6.0)  # for rviz to draw
+rospy.sleep(10.0)  # for rviz to draw
 PY
 /usr/bin/python3 "$work/take.py" "$work/epipolar.ppm"
 import -window root "$work/rviz.png"
 small=(-strip -dither FloydSteinberg -colors 96 -define png:compression-level=9)
-convert "$work/rviz.png" -crop 980x560+290+64 +repage -resize 720x "${small[@]}" "$out/cloud.png"
+convert "$work/rviz.png" -crop 900x556+368+66 +repage -resize 720x "${small[@]}" "$out/cloud.png"
 convert "$work/epipolar.ppm" -crop 100%x84%+0+60 +repage -resize 900x "${small[@]}" "$out/epipolar.png"
 ls -l "$out"/*.png
