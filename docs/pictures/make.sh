@@ -63,7 +63,7 @@ while goals.get_num_connections() == 0:
     rospy.sleep(0.1)
 # rviz starts when it can; pairs are made of what was seen while somebody listened.
 master = rosgraph.Master('/pictures')
-while not any('/rviz' in nodes for topic, nodes in master.getSystemState()[1] if topic == '/camera/points2'):
+while not any('/rviz_rig' in nodes for topic, nodes in master.getSystemState()[1] if topic == '/camera/points2'):
     rospy.sleep(0.5)
 clouds, pictures = [], []
 rospy.Subscriber('/camera/points2', PointCloud2, clouds.append, queue_size=1, buff_size=1 << 25)

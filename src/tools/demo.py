@@ -20,6 +20,7 @@ from pathlib import Path
 HEADLESS_SECONDS = 170.0  # everything, start to end
 BOARD_PATIENCE = 6.0  # before the board is held elsewhere though no view was taken [s]
 REST = 8.0  # of the stage, until a scan that a hand interrupted goes on [s]
+USUAL_PORT = 11311  # of a ROS master
 POSITIONS = [0.0, 0.1, 0.2, 0.3, 0.4]  # of the scan [m]
 ARTEFACTS = ['lens.yaml', 'cloud.ply', 'range.tiff', 'run.bag', 'cloud.png']
 RECORDED = ['/camera/image_raw', '/camera/camera_info', '/camera/lens_model', '/camera/points2',
@@ -246,6 +247,13 @@ def free_port():
         return probe.getsockname()[1]
 
 
+def master_port(headless):
+    """The usual one where people look on, so that `./run exec …` in another shell finds the rig."""
+    with socket.socket() as probe:
+        taken = probe.connect_ex(('127.0.0.1', USUAL_PORT)) == 0
+    return free_port() if headless or taken else USUAL_PORT
+
+
 def start_screen(processes, clock):
     """A virtual screen on a display number of its own choice."""
     receive, send = os.pipe()
@@ -316,8 +324,11 @@ def conduct(options, clock, processes, work):
     display = start_screen(processes, clock) if options.headless else None
     if display:
         os.environ['DISPLAY'] = display
-    port = free_port()
+    port = master_port(options.headless)
     os.environ['ROS_MASTER_URI'] = 'http://127.0.0.1:%d/' % port
+    if port != USUAL_PORT and not options.headless:
+        clock.say('port %d has a master already: type "export ROS_MASTER_URI=%s" in shells that shall see this rig' %
+                  (USUAL_PORT, os.environ['ROS_MASTER_URI']))
     clock.say('starting the rig: simulated camera and stage, calibration, stereo')
     launch = processes.start(
         'roslaunch',
