@@ -2,6 +2,7 @@
 #include "aravis_clock.h"
 
 #include <cmath>
+#include <cstdlib>
 #include <thread>
 
 #include "aravis_features.h"
@@ -16,6 +17,7 @@ using std::chrono::seconds;
 // What the clocks of device and host drift apart in between is less than a millisecond.
 constexpr seconds kLatchAgain(10), kExposureAgain(1), kPtpAgain(1);
 constexpr int kLatches = 3;
+constexpr std::int64_t kClockWasSet = 1000000000;  // [ns]
 
 }  // namespace
 
@@ -158,6 +160,12 @@ Stamp AravisClock::stampOf(ArvBuffer* buffer) {
   // The first packet leaves after the end of the exposure.
   clock_.observe(start + exposure.count(), arrival);
   std::int64_t offset = *clock_.offset();
+  // The host's clock was set: what was measured before holds no more.
+  if (latch_works_.value_or(false) && latch_offset_ &&
+      std::llabs(*latch_offset_ - offset) > kClockWasSet) {
+    latch_offset_.reset();
+    latch_due_ = Steady::now();
+  }
   if (ptp_locked_) {
     // Both clocks are synchronous, but may count leap seconds differently.
     constexpr std::int64_t kSecond = 1000000000, kSlack = 50000000;

@@ -14,9 +14,10 @@
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_models.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/image_input.h"
 #include "omnister/lens/lens_store.h"
+#include "omnister/ros/conversions.h"
+#include "omnister/ros/diagnostic_pace.h"
+#include "omnister/ros/image_input.h"
 
 namespace omnister {
 namespace {
@@ -97,7 +98,7 @@ CalibrationServer::CalibrationServer(const ros::NodeHandle& node,
   diagnostics_.setHardwareID("none");
   diagnostics_.add("calibration", this, &CalibrationServer::diagnose);
   diagnostics_timer_ = node_.createSteadyTimer(
-      ros::WallDuration(1.0),
+      ros::WallDuration(kDiagnosticPeriod),
       [this](const ros::SteadyTimerEvent&) { diagnostics_.force_update(); });
   worker_ = std::thread([this] { run(); });
   server_ = std::make_unique<Server>(

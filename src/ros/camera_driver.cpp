@@ -149,7 +149,8 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   p.stage_frame_id = source.frame("stage_frame_id", p.stage_frame_id);
   p.stage_child_frame_id = source.frame("stage_child_frame_id", p.stage_child_frame_id);
   p.axis = source.direction("axis", p.axis);
-  source.ignore("diagnostic_period");
+  p.diagnostic_period_s =
+      source.number("diagnostic_period", p.diagnostic_period_s, 0.05, 60.0, "s");
   source.warnUnknown();
   return p;
 }
@@ -167,7 +168,8 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
       settings_(parameters_.settings),
       last_frame_(Steady::now()),
       private_node_(callbacks_.on(private_node)),
-      diagnostics_(node, private_node, private_node.getNamespace()) {
+      diagnostics_(node, private_node, private_node.getNamespace()),
+      pace_(parameters_.diagnostic_period_s) {
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
   if (!parameters_.lens.empty()) setLens(readLensFile(parameters_.lens));
   if (!parameters_.parent_frame_id.empty()) {
@@ -186,9 +188,9 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
   trigger_ = node_.advertiseService("trigger", &CameraDriver::onTrigger, this);
-  timer_ = node_.createWallTimer(
+  timer_ = node_.createSteadyTimer(
       ros::WallDuration(std::chrono::duration<double>(kLookAfterDevice).count()),
-      [this](const ros::WallTimerEvent&) { onTimer(); });
+      [this](const ros::SteadyTimerEvent&) { onTimer(); });
   thread_ = std::thread(&CameraDriver::run, this);
   pthread_setname_np(thread_.native_handle(), "camera");
   callbacks_.start();
@@ -539,7 +541,7 @@ void CameraDriver::onTimer() {
     fromControls(controls, &config_);
     config_server_->updateConfig(config_);
   }
-  diagnostics_.update();
+  if (pace_.due()) diagnostics_.force_update();
 }
 
 void CameraDriver::countLost(const device::Frame& frame) {

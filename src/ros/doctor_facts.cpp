@@ -421,6 +421,7 @@ DoctorFacts gatherFacts(const DoctorOptions& options) {
     ros::WallDuration(0.1).sleep();
     const double waited = (ros::SteadyTime::now() - start).toSec();
     if (waited >= options.seconds || !ros::ok()) break;
+    if (options.interrupt && options.interrupt()) break;
     const std::lock_guard<std::mutex> lock(ears.mutex);
     // All is said when a cloud came and the diagnostics of the same time.
     const auto status = ears.statuses.find(status_name);

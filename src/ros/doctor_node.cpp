@@ -10,12 +10,16 @@
 #include <cstdlib>
 #include <iostream>
 #include <nlohmann/json.hpp>
+#include <utility>
 
 #include "omnister/common/error.h"
+#include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/doctor_facts.h"
 
 namespace omnister {
 namespace {
+
+constexpr double kMasterPeriod = 0.25;  // [s] between questions to the master
 
 bool healthy(const std::vector<Finding>& findings) {
   for (const Finding& finding : findings)
@@ -58,7 +62,7 @@ void printText(const DoctorFacts& facts, const std::vector<Finding>& findings) {
 }
 
 /// Long after the start: the master may have gone, or been started anew.
-DoctorFacts look(const DoctorOptions& options) {
+DoctorFacts masterFacts() {
   DoctorFacts facts;
   facts.master_uri = ros::master::getURI();
   facts.master = answers(facts.master_uri) && ros::master::check();
@@ -66,14 +70,30 @@ DoctorFacts look(const DoctorOptions& options) {
   facts.registered =
       !facts.master || !ros::master::getNodes(nodes) ||
       std::find(nodes.begin(), nodes.end(), ros::this_node::getName()) != nodes.end();
+  return facts;
+}
+
+bool masterKnowsUs() {
+  const DoctorFacts facts = masterFacts();
+  return facts.master && facts.registered;
+}
+
+DoctorFacts look(const DoctorOptions& options) {
+  const DoctorFacts facts = masterFacts();
   return facts.master && facts.registered ? gatherFacts(options) : facts;
 }
 
-void watch(const DoctorOptions& options, double period) {
+void watch(DoctorOptions options, double period) {
   ros::NodeHandle node;
+  DiagnosticPace pace(kMasterPeriod);
+  bool known = true;
+  // That the master went is told at once.
+  options.interrupt = [&] { return known && pace.due() && !masterKnowsUs(); };
   ros::Publisher publisher = node.advertise<diagnostic_msgs::DiagnosticArray>("/diagnostics", 10);
   while (ros::ok()) {
     const std::vector<Finding> findings = diagnose(look(options));
+    const bool knew = std::exchange(known, masterKnowsUs());
+    if (knew && !known) continue;
     diagnostic_msgs::DiagnosticArray message;
     message.header.stamp = ros::Time::now();
     diagnostic_msgs::DiagnosticStatus status;
@@ -93,7 +113,9 @@ void watch(const DoctorOptions& options, double period) {
     }
     message.status.push_back(status);
     publisher.publish(message);
-    ros::WallDuration(period).sleep();
+    const ros::SteadyTime start = ros::SteadyTime::now();
+    while (ros::ok() && (ros::SteadyTime::now() - start).toSec() < period && !options.interrupt())
+      ros::WallDuration(std::min(kMasterPeriod, period)).sleep();
   }
 }
 

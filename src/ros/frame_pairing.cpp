@@ -114,6 +114,7 @@ FramePairing::Verdict FramePairing::judge(PairingFrame& frame, const PoseLookup&
     const double turned = angle(at.T_fixed_camera, beside.T_fixed_camera);
     if (!(moved <= options_.settle_distance) || !(turned <= options_.settle_angle)) {
       const bool jumps = moved > kFastest * options_.settle_time;
+      leaps_ += jumps;
       drop("moving", std::string(jumps ? "tf jumps (does somebody else publish it?): "
                                        : "the camera moves: ") +
                          metres(moved) + " and " + degrees(turned) + " within " +

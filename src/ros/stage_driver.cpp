@@ -55,7 +55,8 @@ StageParameters loadStageParameters(const ros::NodeHandle& private_node, StagePa
   p.frame_id = source.frame("frame_id", p.frame_id);
   p.child_frame_id = source.frame("child_frame_id", p.child_frame_id);
   p.joint_name = source.frame("joint_name", p.joint_name);
-  source.ignore("diagnostic_period");
+  p.diagnostic_period_s =
+      source.number("diagnostic_period", p.diagnostic_period_s, 0.05, 60.0, "s");
   source.warnUnknown();
   return p;
 }
@@ -87,6 +88,7 @@ StageDriver::StageDriver(const ros::NodeHandle& node, const ros::NodeHandle& pri
       open_(std::move(open)),
       state_publisher_(node_.advertise<StageState>("stage_state", 50)),
       diagnostics_(node, private_node, private_node.getNamespace()),
+      pace_(parameters_.diagnostic_period_s),
       server_(
           node_, "move_stage", [this](Server::GoalHandle handle) { onGoal(std::move(handle)); },
           [this](Server::GoalHandle handle) { onCancel(std::move(handle)); }, false) {
@@ -135,7 +137,7 @@ void StageDriver::run() {
         lostLocked(e.what());
       }
     }
-    diagnostics_.update();
+    if (pace_.due()) diagnostics_.force_update();
     next = std::max(next + period, Steady::now());
     std::this_thread::sleep_until(next);
   }

@@ -16,6 +16,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
 #include "omnister/ros/conversions.h"
+#include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/lens_markers.h"
 #include "omnister/ros/live_parameters.h"
@@ -34,6 +35,7 @@ constexpr std::uint32_t kLensesWaiting = 16;
 constexpr std::size_t kMostClicked = 8;  // pixels of the overlay; the oldest go first
 constexpr double kWarningPeriod = 5.0;   // [s]
 constexpr double kQuiet = 0.7;           // [s] without a cloud that call for no reason
+constexpr double kNearlyEmpty = 1.0;     // [%] of the pixels
 constexpr double kFuture = 2.0;          // [s] that tf may run ahead of the clock
 constexpr std::size_t kCloudsKept = 3;   // messages that are filled again when nobody holds them
 constexpr double kSilencePeriod = 10.0;  // [s] without a cloud until it is said why
@@ -132,9 +134,11 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
   diagnostics_.add("stereo", this, &StereoPipeline::diagnose);
   diagnostics_.add("calibration", &drift_, &DriftDiagnostic::diagnose);
   // By the steady clock, so that it goes on while a recording pauses.
-  diagnostics_timer_ = node_.createSteadyTimer(
-      ros::WallDuration(1.0),
-      [this](const ros::SteadyTimerEvent&) { diagnostics_.force_update(); });
+  diagnostics_timer_ = node_.createSteadyTimer(ros::WallDuration(kDiagnosticPeriod),
+                                               [this](const ros::SteadyTimerEvent&) {
+                                                 warnOfClock();
+                                                 diagnostics_.force_update();
+                                               });
   thread_ = std::thread([this] { run(); });
   callbacks_.start();
 }
@@ -326,20 +330,24 @@ void StereoPipeline::count(const sensor_msgs::Image& image, std::size_t eye) {
     drops_["missed"] += missing;
 }
 
+void StereoPipeline::warn(const std::string& name, const std::string& text) {
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    const ros::SteadyTime now = ros::SteadyTime::now();
+    const auto last = warned_.find(name);
+    if (last != warned_.end() && (now - last->second).toSec() < kWarningPeriod) return;
+    warned_[name] = now;
+  }
+  ROS_WARN("%s", printable(text, 500).c_str());
+}
+
 void StereoPipeline::drop(const std::string& name, const std::string& reason, bool fault) {
-  bool say = false;
   {
     std::lock_guard<std::mutex> lock(mutex_);
     ++drops_[name];
     reason_ = reason;
-    if (fault) {
-      const ros::SteadyTime now = ros::SteadyTime::now();
-      const auto last = warned_.find(name);
-      say = last == warned_.end() || (now - last->second).toSec() >= kWarningPeriod;
-      if (say) warned_[name] = now;
-    }
   }
-  if (say) ROS_WARN("%s", printable(reason, 500).c_str());
+  if (fault) warn(name, reason);
 }
 
 void StereoPipeline::onLens(const LensModelMessage::ConstPtr& message, std::size_t eye) {
@@ -416,6 +424,8 @@ void StereoPipeline::onImages(const sensor_msgs::ImageConstPtr& left,
   job.T_ref_disp = {*T_left_right};
   {
     std::lock_guard<std::mutex> lock(mutex_);
+    skew_ = std::abs((left->header.stamp - right->header.stamp).toSec());
+    most_skew_ = std::max(most_skew_, skew_);
     putPending(std::move(job));
   }
   wake_.notify_all();
@@ -510,12 +520,32 @@ void StereoPipeline::putPending(StereoSet job) {
   pending_ = std::move(job);
 }
 
+void StereoPipeline::warnOfLeaps() {
+  std::string reason;
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (std::exchange(leaps_, pairing_.leaps()) == leaps_) return;
+    reason = pairing_.reason();
+  }
+  warn("leap", reason);
+}
+
+void StereoPipeline::warnOfClock() {
+  // A recording's clock goes as it likes.
+  if (!ros::Time::isSystemTime()) return;
+  if (const std::optional<double> by =
+          clock_watch_.jump(ros::Time::now().toSec(), ros::SteadyTime::now().toSec()))
+    ROS_WARN("the clock of this machine was set %s by %.1f s", *by > 0.0 ? "ahead" : "back",
+             std::abs(*by));
+}
+
 void StereoPipeline::run() {
   for (;;) {
     std::optional<StereoSet> job;
     try {
       job = nextJob();
       if (job) process(*job);
+      warnOfLeaps();
     } catch (const std::exception& error) {
       drop("failed", error.what(), true);
     }
@@ -642,6 +672,14 @@ void StereoPipeline::process(const StereoSet& job) {
   if (result.statistics.valid * 20 < matched->grey.total()) {
     for (const std::string& line : imageRemarks(prepared.reference, prepared.displaced))
       remark += (remark.empty() ? "" : "; ") + line;
+    const double percent = 100.0 * static_cast<double>(result.statistics.valid) /
+                           static_cast<double>(matched->grey.total());
+    if (remark.empty() && percent < kNearlyEmpty)
+      remark = formatNumber(std::round(10.0 * percent) / 10.0) +
+               " % of the pixels have a range, most are rejected by the test '" +
+               mostRejecting(result.statistics) +
+               "': does the camera stand where tf says that it does?";
+    if (!remark.empty()) warn("nearly empty", "clouds are nearly empty: " + remark);
   }
 
   StageTimes times;
@@ -699,10 +737,6 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
     status.summary(DiagnosticStatus::WARN, "no cloud: " + printable(silent, 300));
   else if (clouds_ > 0 && !last_remark_.empty())
     status.summary(DiagnosticStatus::WARN, "clouds are nearly empty: " + last_remark_);
-  else if (clouds_ > 0 && last_statistics_.valid == 0)
-    status.summary(DiagnosticStatus::WARN,
-                   "clouds are empty: every pixel is rejected, most by the test '" +
-                       mostRejecting(last_statistics_) + "'");
   else
     status.summary(DiagnosticStatus::OK, "running");
   for (const Eye& eye : eyes_) {
@@ -717,6 +751,10 @@ void StereoPipeline::diagnose(diagnostic_updater::DiagnosticStatusWrapper& statu
       status.add("seconds, " + stage, seconds);
     for (const auto& [test, pixels] : last_statistics_.rejected)
       status.add("pixels rejected, " + test, pixels);
+  }
+  if (parameters_.rig && most_skew_ >= 0.0) {
+    status.add("between left and right [s]", skew_);
+    status.add("between left and right, most [s]", most_skew_);
   }
   if (pairing_.missedBaseline()) status.add("baseline missed [m]", *pairing_.missedBaseline());
   for (const auto& [name, count] : pairing_.counts()) status.add("frames, " + name, count);

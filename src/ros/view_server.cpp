@@ -9,6 +9,7 @@
 
 #include "omnister/common/error.h"
 #include "omnister/ros/conversions.h"
+#include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/live_parameters.h"
 
@@ -101,7 +102,7 @@ ViewServer::ViewServer(const ros::NodeHandle& node, const ros::NodeHandle& priva
   diagnostics_.setHardwareID("none");
   diagnostics_.add("view", this, &ViewServer::diagnose);
   diagnostics_timer_ = node_.createSteadyTimer(
-      ros::WallDuration(1.0),
+      ros::WallDuration(kDiagnosticPeriod),
       [this](const ros::SteadyTimerEvent&) { diagnostics_.force_update(); });
   callbacks_.start();
 }

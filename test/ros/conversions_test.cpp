@@ -10,6 +10,7 @@
 #include <opencv2/core.hpp>
 
 #include "omnister/lens/lens_models.h"
+#include "omnister/ros/clock_watch.h"
 #include "omnister/ros/image_input.h"
 
 namespace omnister {
@@ -51,6 +52,17 @@ TEST(Stamps, SurviveTheRoundTripAndStayInRange) {
   EXPECT_EQ(
       toRosTime(device::Stamp(std::chrono::nanoseconds(std::numeric_limits<std::int64_t>::max()))),
       ros::TIME_MAX);
+}
+
+TEST(ClockWatch, TellsAClockThatWasSetFromOneThatIsKept) {
+  ClockWatch watch;
+  EXPECT_FALSE(watch.jump(1.7e9, 100.0));
+  // Kept by a daemon: a little fast, then slow.
+  for (int i = 1; i <= 10; ++i) EXPECT_FALSE(watch.jump(1.7e9 + 1.0005 * i, 100.0 + i)) << i;
+  EXPECT_NEAR(watch.jump(1.7e9 + 41.0, 111.0).value_or(0.0), 30.0, 0.01);
+  EXPECT_FALSE(watch.jump(1.7e9 + 42.0, 112.0));
+  EXPECT_NEAR(watch.jump(1.7e9 - 60.0, 113.0).value_or(0.0), -103.0, 0.01);
+  EXPECT_FALSE(watch.jump(1.7e9 - 50.0, 123.0));
 }
 
 TEST(Transforms, SurviveTheRoundTripAndRefuseNonsense) {

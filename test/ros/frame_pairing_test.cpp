@@ -262,6 +262,30 @@ TEST(FramePairing, AnotherFrameIdStartsAnew) {
   EXPECT_EQ(pairing.counts().at("resets"), 1u);
 }
 
+TEST(FramePairing, ALeapThatNoStageMakesIsSomebodyElsesTf) {
+  FramePairing pairing(options());
+  // 10 cm within 40 ms, there and back.
+  const auto torn = [](const std::string&, std::int64_t stamp_ns) {
+    PoseAnswer answer;
+    answer.state = PoseAnswer::State::kKnown;
+    answer.T_fixed_camera.translation().x() = stamp_ns / (40 * kMillisecond) % 2 == 0 ? 0.0 : 0.1;
+    return answer;
+  };
+  for (const int t : {500, 600}) {
+    pairing.add(frameAt(t), 0);
+    EXPECT_FALSE(pairing.poll(torn, 0));
+  }
+  EXPECT_EQ(pairing.leaps(), 2u);
+  EXPECT_FALSE(pairing.moving());
+  EXPECT_THAT(pairing.reason(), HasSubstr("tf jumps"));
+  // A stage is slower: half a metre a second.
+  const Stage stage{{0.0, 0.1}};
+  pairing.add(frameAt(900), 0);
+  EXPECT_FALSE(pairing.poll(stage, 0));
+  EXPECT_EQ(pairing.leaps(), 2u);
+  EXPECT_TRUE(pairing.moving());
+}
+
 TEST(FramePairing, OnlyTheNewestOfSeveralSetsComesOut) {
   FramePairing pairing(options());
   const Stage stage{{0.0, 0.1}};

@@ -40,6 +40,7 @@
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_store.h"
 #include "omnister/ros/callback_threads.h"
+#include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/static_frames.h"
 
@@ -55,9 +56,10 @@ struct CameraParameters {
   device::CameraSettings settings;
   std::string parent_frame_id;    ///< carries <camera>_link; empty: no static tf
   Pose mount = Pose::Identity();  ///< T_parent_link
-  double retry_period_s = 1.0;    ///< between attempts to open the device
-  double watchdog_s = 1.5;        ///< a device without a frame for so long is lost
-  bool exit_on_error = false;     ///< the node ends instead of trying again
+  double retry_period_s = 0.5;    ///< between attempts to open the device
+  double diagnostic_period_s = kDiagnosticPeriod;
+  double watchdog_s = 1.5;     ///< a device without a frame for so long is lost
+  bool exit_on_error = false;  ///< the node ends instead of trying again
   // Of a recording that knows stage positions:
   std::string stage_frame_id = "stage_base";
   std::string stage_child_frame_id = "stage_carriage";
@@ -195,8 +197,9 @@ class CameraDriver {
   std::unique_ptr<dynamic_reconfigure::Server<CameraConfig>> config_server_;  // of the timer
   CameraConfig config_;                                                       // as it was last told
   bool config_ready_ = false;
-  ros::WallTimer timer_;
+  ros::SteadyTimer timer_;
   diagnostic_updater::Updater diagnostics_;
+  DiagnosticPace pace_;
   std::atomic<bool> stop_{false};
   std::atomic<bool> failed_{false};
   std::thread thread_;

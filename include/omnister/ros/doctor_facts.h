@@ -5,6 +5,7 @@
 
 #include <ros/ros.h>
 
+#include <functional>
 #include <string>
 
 #include "omnister/ros/doctor.h"
@@ -17,6 +18,8 @@ struct DoctorOptions {
   /// Listen to nothing that would make others work (clouds, images): only graph, diagnostics, tf
   /// and stage.
   bool passive = false;
+  /// Of a passive look: asked while it listens; true ends it early.
+  std::function<bool()> interrupt;
 };
 
 /// Facts of this machine only: what can be told without a master.

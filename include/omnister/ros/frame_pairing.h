@@ -89,6 +89,8 @@ class FramePairing {
   const std::string& reason() const { return reason_; }
   /// The last frame that was looked up was dropped because the camera moves: that passes by itself.
   bool moving() const { return moving_; }
+  /// Frames dropped because tf leaps as no stage moves: somebody else publishes it.
+  std::size_t leaps() const { return leaps_; }
   /// Since the last set: the distance between two places that came last and was not within the
   /// baseline limits [m].
   const std::optional<double>& missedBaseline() const { return missed_baseline_; }
@@ -115,6 +117,7 @@ class FramePairing {
   std::optional<std::int64_t> last_stamp_ns_;
   std::string reason_ = "no image yet";
   bool moving_ = false;
+  std::size_t leaps_ = 0;
   std::optional<double> missed_baseline_;
   std::map<std::string, std::size_t> counts_;
 };

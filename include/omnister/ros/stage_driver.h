@@ -29,6 +29,7 @@
 
 #include "omnister/device/stage.h"
 #include "omnister/ros/callback_threads.h"
+#include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/external_stage.h"
 
 namespace omnister {
@@ -48,6 +49,7 @@ struct StageParameters {
   double move_timeout_s = 120.0;  ///< a motion that takes longer is stopped
   double home_timeout_s = 60.0;   ///< so is homing
   double retry_period_s = 1.0;    ///< between attempts to open the device
+  double diagnostic_period_s = kDiagnosticPeriod;
   bool publish_tf = true;
   bool required = false;  ///< gives up when the device cannot be opened or is lost, see failed()
   std::string frame_id = "stage_base";
@@ -141,6 +143,7 @@ class StageDriver {
   ros::Publisher state_publisher_;
   tf2_ros::TransformBroadcaster transforms_;
   diagnostic_updater::Updater diagnostics_;
+  DiagnosticPace pace_;
   Server server_;
   ros::ServiceServer home_;
   ros::ServiceServer halt_;

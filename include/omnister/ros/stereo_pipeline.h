@@ -27,6 +27,7 @@
 
 #include "omnister/lens/lens_file.h"
 #include "omnister/ros/callback_threads.h"
+#include "omnister/ros/clock_watch.h"
 #include "omnister/ros/drift_diagnostic.h"
 #include "omnister/ros/frame_pairing.h"
 #include "omnister/ros/image_input.h"
@@ -105,7 +106,9 @@ class StereoPipeline {
 
   void run();
   std::optional<StereoSet> nextJob();
-  void pollPairing();              ///< mutex_ is held
+  void pollPairing();  ///< mutex_ is held
+  void warnOfLeaps();
+  void warnOfClock();
   void putPending(StereoSet job);  ///< mutex_ is held
   void process(const StereoSet& job);
   void publishOverlay(const MatchedSet& matched, const StereoParameters& live);
@@ -120,7 +123,9 @@ class StereoPipeline {
   std::string whySilent() const;
   cv::Size expectedSize(std::size_t eye) const;
 
-  /// Counts a dropped frame or set and remembers why; `fault`: also warns, throttled by name.
+  /// Warns, throttled by name.
+  void warn(const std::string& name, const std::string& text);
+  /// Counts a dropped frame or set and remembers why; `fault`: also warns.
   void drop(const std::string& name, const std::string& reason, bool fault);
 
   const StereoParameters parameters_;  ///< as loaded; what may change is in live_
@@ -161,11 +166,14 @@ class StereoPipeline {
   std::map<std::string, std::size_t> drops_;
   std::map<std::string, ros::SteadyTime> warned_;
   std::string reason_ = "no image yet";
+  std::size_t leaps_ = 0;  ///< of pairing_, that were warned of
   std::size_t clouds_ = 0;
   ros::SteadyTime last_start_;   ///< of a match
   ros::SteadyTime last_cloud_;   ///< or since when somebody listens
   ros::SteadyTime last_image_;   ///< of the reference camera; zero: none yet
   double image_interval_ = 0.0;  ///< between the last two [s]
+  double skew_ = 0.0;            ///< rig: between the stamps of the last pair [s]
+  double most_skew_ = -1.0;      ///< of all pairs; negative: none yet
   MatchStatistics last_statistics_;
   int last_positions_ = 0;   ///< displaced images of the last cloud
   std::string last_remark_;  ///< what is wrong with its images, where it is next to nothing
@@ -178,6 +186,7 @@ class StereoPipeline {
   DriftDiagnostic drift_;
   diagnostic_updater::Updater diagnostics_;
   ros::SteadyTimer diagnostics_timer_;
+  ClockWatch clock_watch_;  ///< used by it only
   boost::recursive_mutex config_mutex_;
   std::unique_ptr<dynamic_reconfigure::Server<StereoConfig>> config_server_;
 };
