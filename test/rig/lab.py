@@ -3,6 +3,7 @@
 tests that run it for long (soak.py) or break it (faults.py)."""
 import collections
 import contextlib
+import glob
 import os
 import re
 import socket
@@ -115,13 +116,49 @@ class Watcher:
         return float(self.values[diagnostic].get(key, '0'))
 
 
+def start_master(processes, clock, port=None):
+    """On a free port, which it returns, or on the one it had before."""
+    port = port or demo.free_port()
+    os.environ['ROS_MASTER_URI'] = 'http://127.0.0.1:%d/' % port
+    processes.start('rosmaster', ['rosmaster', '--core', '-p', str(port)])
+
+    def answers():
+        with socket.socket() as probe:
+            return probe.connect_ex(('127.0.0.1', port)) == 0
+
+    clock.wait('the start of the ROS master', answers, 30.0)
+    return port
+
+
+class MachineClock:
+    """The time of day of the rig's nodes. Its hardware, these tests and everybody else keep theirs."""
+
+    def __init__(self, file):
+        self.file = file
+        self.set(0)
+
+    @staticmethod
+    def library():
+        """Debian's libfaketime; None where it is not installed."""
+        return next(iter(sorted(glob.glob('/usr/lib/*/faketime/libfaketimeMT.so.1'))), None)
+
+    def set(self, seconds):
+        """Ahead of the true time."""
+        beside = self.file.with_suffix('.new')
+        beside.write_text('%+d\n' % seconds)
+        beside.rename(self.file)
+
+
+
 class Lab:
     """`with Lab(...) as lab:` a running rig, its watcher and the hands on it; everything ends with it."""
 
-    def __init__(self, log_folder=None, **arguments):
+    def __init__(self, log_folder=None, own_clock=False, **arguments):
         self.arguments = arguments
+        self.own_clock = own_clock
         self.log_folder = log_folder
         self.faults = None
+        self.port = None
 
     def __enter__(self):
         self.stack = contextlib.ExitStack()
@@ -132,13 +169,14 @@ class Lab:
             self.clock = demo.Clock(None)
             self.processes = demo.Processes(logs)
             stack.callback(self.processes.stop_all)
-            self.port = demo.free_port()
             demo.prepare_environment(self.work, False)
-            os.environ['ROS_MASTER_URI'] = 'http://127.0.0.1:%d/' % self.port
             self.start_master()
             import rospy
             self.rospy = rospy
             self.output = []  # (time, line) of what roslaunch and the nodes say
+            if self.own_clock:
+                self.machine_clock = MachineClock(self.work / 'clock')
+                self.arguments.update(clock=self.machine_clock.file, clock_library=MachineClock.library())
             self.launch = self.processes.start(
                 'roslaunch', ['roslaunch', '--skip-log-check', str(HERE / 'lab.launch'),
                               'work:=%s' % self.work] + ['%s:=%s' % item for item in self.arguments.items()],
@@ -154,13 +192,7 @@ class Lab:
         self.stack.close()
 
     def start_master(self):
-        self.processes.start('rosmaster', ['rosmaster', '--core', '-p', str(self.port)])
-
-        def answers():
-            with socket.socket() as probe:
-                return probe.connect_ex(('127.0.0.1', self.port)) == 0
-
-        self.clock.wait('the start of the ROS master', answers, 30.0)
+        self.port = start_master(self.processes, self.clock, self.port)
 
     def first_cloud(self):
         """Slides to and fro until one comes."""
