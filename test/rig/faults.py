@@ -322,7 +322,8 @@ def table(rows):
              '| --- | --- | --- | --- | --- |']
     for row in rows:
         lost = ', '.join('%d %s' % (count, name) for name, count in row['lost'].items()) or 'nothing'
-        seen = re.sub(r'[0-9.]{12,}|/tmp/\S+/', '…', row['seen'] or 'nothing: it goes on').replace('|', '/')
+        seen = row['seen'] or 'nothing: it goes on'
+        seen = re.sub(r'[0-9.]{12,}|/tmp/\S+/', '…', re.sub(r' \[pid .*', '', seen)).replace('|', '/')
         noticed = '-' if row['passing'] and row['noticed_s'] is None else seconds(row['noticed_s'])
         lines.append('| %s | %s | %s | %s | %s |' % (row['fault'], seen[:120], noticed, seconds(row['recovered_s']), lost))
     return '\n'.join(lines) + '\n'
