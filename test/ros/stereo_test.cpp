@@ -747,8 +747,11 @@ TEST(Stereo, RefusesParametersByName) {
 }
 
 TEST(StereoMessages, CloudsComeBackAsTheyWent) {
-  Cloud cloud{cv::Mat(3, 5, CV_32FC3), cv::Mat(3, 5, CV_8UC3), cv::Mat(3, 5, CV_32FC1),
-              cv::Mat(3, 5, CV_32FC1)};
+  // Rows begin at any address, and are longer than the blocks that they are written in.
+  constexpr int kRows = 3, kColumns = 133;
+  const cv::Size size(kColumns, kRows);
+  Cloud cloud{cv::Mat(size, CV_32FC3), cv::Mat(size, CV_8UC3), cv::Mat(size, CV_32FC1),
+              cv::Mat(size, CV_32FC1)};
   cv::randu(cloud.xyz, -5.0F, 5.0F);
   cv::randu(cloud.bgr, 0, 255);
   cv::randu(cloud.sigma, 0.0F, 1.0F);
@@ -760,13 +763,14 @@ TEST(StereoMessages, CloudsComeBackAsTheyWent) {
   EXPECT_EQ(cv::norm(back.sigma, cloud.sigma, cv::NORM_INF), 0.0);
   EXPECT_EQ(cv::norm(back.score, cloud.score, cv::NORM_INF), 0.0);
   const auto ranges = [](const sensor_msgs::PointCloud2& of) {
-    cv::Mat result(3, 5, CV_32FC1);
+    cv::Mat result(kRows, kColumns, CV_32FC1);
     sensor_msgs::PointCloud2ConstIterator<float> in(of, "range");
-    for (int i = 0; i < 15; ++i, ++in) result.at<float>(i / 5, i % 5) = *in;
+    for (int i = 0; i < kRows * kColumns; ++i, ++in)
+      result.at<float>(i / kColumns, i % kColumns) = *in;
     return result;
   };
-  for (int v = 0; v < 3; ++v)
-    for (int u = 0; u < 5; ++u)
+  for (int v = 0; v < kRows; ++v)
+    for (int u = 0; u < kColumns; ++u)
       EXPECT_FLOAT_EQ(ranges(*message).at<float>(v, u), cv::norm(cloud.xyz.at<cv::Vec3f>(v, u)));
   // Filled right from a match it is the same, and so is one that was filled before.
   MatchResult match;
@@ -783,8 +787,8 @@ TEST(StereoMessages, CloudsComeBackAsTheyWent) {
         toPointCloud(makeCloud(match, cloud.xyz, picture), {});
     EXPECT_EQ(filled.fields, whole->fields);
     const Cloud a = fromPointCloud(filled), b = fromPointCloud(*whole);
-    for (int v = 0; v < 3; ++v) {
-      for (int u = 0; u < 5; ++u) {
+    for (int v = 0; v < kRows; ++v) {
+      for (int u = 0; u < kColumns; ++u) {
         const cv::Vec3f p = a.xyz.at<cv::Vec3f>(v, u), q = b.xyz.at<cv::Vec3f>(v, u);
         EXPECT_TRUE(p == q || (std::isnan(p[0]) && std::isnan(q[0]))) << u << " " << v;
       }
