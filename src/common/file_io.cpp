@@ -81,7 +81,7 @@ void keepPrevious(const fs::path& target) {
 fs::path resolveLink(fs::path path) {
   std::error_code ignored;
   if (fs::is_symlink(path, ignored)) {
-    const fs::path resolved = fs::weakly_canonical(path, ignored);
+    fs::path resolved = fs::weakly_canonical(path, ignored);
     if (!ignored) return resolved;
   }
   return path;

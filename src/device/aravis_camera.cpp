@@ -119,7 +119,7 @@ class AravisCamera : public Camera {
   std::vector<std::string> takeDetails() override { return on_.takeDetails(); }
 
   CameraControls controls() override {
-    const CameraControls now = readControls(on_);
+    CameraControls now = readControls(on_);
     if (now.exposure_us) clock_.setExposure(*now.exposure_us);
     return now;
   }
