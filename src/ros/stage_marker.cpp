@@ -103,9 +103,9 @@ void StageMarker::insert(double position, const std::string& text) {
   slide.orientation.z = along.z();
   marker.controls.push_back(slide);
 
-  InteractiveMarkerControl body;
+  // The box itself can be dragged too; every control has the menu (right click).
+  InteractiveMarkerControl body = slide;
   body.name = "body";
-  body.interaction_mode = InteractiveMarkerControl::MENU;
   body.always_visible = 1;
   Marker box;
   box.type = Marker::CUBE;

@@ -101,6 +101,9 @@ TEST_F(StageHandle, ShowsWhereTheStageIs) {
   EXPECT_NEAR(marker.pose.position.y, -position(), 2e-3);
   EXPECT_NEAR(marker.pose.position.z, -0.2, 1e-6) << "below the lens surface, which would hide it";
   EXPECT_EQ(marker.menu_entries.size(), 3u);
+  for (const auto& control : marker.controls)
+    EXPECT_EQ(control.interaction_mode, visualization_msgs::InteractiveMarkerControl::MOVE_AXIS)
+        << "box and arrows are dragged along the travel";
 }
 
 }  // namespace
