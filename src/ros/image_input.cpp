@@ -27,17 +27,32 @@ std::string eightBit(const std::string& encoding) {
   return encoding;
 }
 
+InputError badEncoding(const std::exception& error) {
+  return InputError("image", "encoding", printable(error.what()));
+}
+
+/// The message's own pixels, as they are.
+cv::Mat nativePixels(const sensor_msgs::Image& image) {
+  try {
+    return cv_bridge::toCvShare(image, {})->image;
+  } catch (const cv_bridge::Exception& error) {
+    throw badEncoding(error);
+  } catch (const cv::Exception& error) {
+    throw badEncoding(error);
+  }
+}
+
 cv::Mat convert(const sensor_msgs::Image& image, int bits, const std::string& wanted) {
   if (foreignByteOrder(image)) return convert(*inOwnByteOrder(image), bits, wanted);
   try {
-    const cv_bridge::CvImageConstPtr native = cv_bridge::toCvShare(image, {});
+    const cv::Mat native = nativePixels(image);
     cv_bridge::CvImage eight(image.header, eightBit(image.encoding));
-    switch (native->image.depth()) {
+    switch (native.depth()) {
       case CV_8U:
-        eight.image = native->image;
+        eight.image = native;
         break;
       case CV_16U:
-        native->image.convertTo(eight.image, CV_8U, 1.0 / (1 << (bits - 8)));
+        native.convertTo(eight.image, CV_8U, 1.0 / (1 << (bits - 8)));
         break;
       default:
         throw InputError(
@@ -47,9 +62,9 @@ cv::Mat convert(const sensor_msgs::Image& image, int bits, const std::string& wa
     if (eight.encoding == wanted) return eight.image.clone();
     return cv_bridge::cvtColor(boost::make_shared<cv_bridge::CvImage>(eight), wanted)->image;
   } catch (const cv_bridge::Exception& error) {
-    throw InputError("image", "encoding", printable(error.what()));
+    throw badEncoding(error);
   } catch (const cv::Exception& error) {
-    throw InputError("image", "encoding", printable(error.what()));
+    throw badEncoding(error);
   }
 }
 
@@ -87,7 +102,7 @@ void checkFrame(const sensor_msgs::Image& image, cv::Size expected, const std::s
 int significantBits(const sensor_msgs::Image& image) {
   if (enc::bitDepth(image.encoding) != 16) return 8;
   if (foreignByteOrder(image)) return significantBits(*inOwnByteOrder(image));
-  cv::Mat native = cv_bridge::toCvShare(image, {})->image;
+  const cv::Mat native = nativePixels(image);
   if (native.depth() != CV_16U) return 8;
   double brightest = 0.0;
   cv::minMaxLoc(native.reshape(1), nullptr, &brightest);
