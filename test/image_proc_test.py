@@ -75,10 +75,10 @@ def main():
         with open(folder / 'roslaunch.log', 'wb') as log:
             launch = subprocess.Popen([run, 'exec', 'roslaunch', '-p', str(port), str(folder / 'test.launch')],
                                       stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
+        import rosgraph
+        import rospy
+        from sensor_msgs.msg import CameraInfo, Image
         try:
-            import rosgraph
-            import rospy
-            from sensor_msgs.msg import CameraInfo, Image
             while not rosgraph.is_master_online():
                 if launch.poll() is not None:
                     raise SystemExit('roslaunch ended:\n' + (folder / 'roslaunch.log').read_text())
@@ -87,6 +87,8 @@ def main():
             rectified = pixels(rospy.wait_for_message('/camera/image_rect_color', Image, 120))
             raw = pixels(rospy.wait_for_message('/camera/image_raw', Image, 120))
             info = rospy.wait_for_message('/camera/camera_info', CameraInfo, 120)
+        except rospy.ROSException as problem:
+            raise SystemExit('%s; roslaunch said:\n%s' % (problem, (folder / 'roslaunch.log').read_text(errors='replace')))
         finally:
             os.killpg(launch.pid, signal.SIGINT)
             launch.wait()
