@@ -178,7 +178,8 @@ class EveryNode(unittest.TestCase):
 
     def all_are_there(self):
         for kind in self.programs:
-            self.assertTrue(eventually(lambda: self.offered(kind)), '%s lacks %s' % (kind, self.missing(kind)))
+            self.assertTrue(eventually(lambda: self.offered(kind)), '%s lacks %s; it said: %s' % (
+                kind, self.missing(kind), self.programs[kind].output.decode()[-2000:]))
 
     @contextlib.contextmanager
     def listener(self, topic, kind):
