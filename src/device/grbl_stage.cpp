@@ -37,6 +37,7 @@ constexpr double kSameInMotion = 50.0;
 // A jog that was accepted shows in the reports after this.
 constexpr std::chrono::milliseconds kTimeToBegin(400);
 
+constexpr int kReportsAfterHoming = 2;
 constexpr char kHome[] = "$H";
 constexpr char kReset = 0x18;
 constexpr char kJogCancel = static_cast<char>(0x85);
@@ -70,6 +71,7 @@ class GrblStage : public SerialStage {
   void jog(const std::string& line);
   /// Asks for a report. @throws StageError when none comes
   void poll();
+  void watchHoming();
   /// A report has no checksum: whether it fits where the stage was and what it was told.
   enum class Fit { kCertain, kPossible, kContradiction };
   Fit fitOf(const GrblStatus& status, double position, Stamp stamp) const;
@@ -104,6 +106,7 @@ class GrblStage : public SerialStage {
   int alarm_ = 0;
   bool homed_ = false;
   bool homing_ = false;
+  int reports_in_homing_ = 0;
   bool homing_stopped_ = false;
   std::uint64_t reference_ = 0;
   bool moved_ = true;             ///< told to move since the last report at rest
@@ -340,6 +343,24 @@ void GrblStage::poll() {
   throw StageError("the stage on " + printable(port_.path()) + " does not report its state");
 }
 
+void GrblStage::watchHoming() {
+  // Nothing is reported while it homes: a report tells that it is over, and the "ok" stands before
+  // or close behind it, if it came at all. Without it nobody knows how homing went.
+  if (report_ && report_->state != "Home") {
+    report_.reset();
+    if (++reports_in_homing_ > kReportsAfterHoming) {
+      homing_ = false;
+      loseReference();
+      next_poll_ = Steady::now();
+      remark("the end of homing was not heard: home it again");
+      return;
+    }
+  }
+  if (Steady::now() < next_poll_) return;
+  port_.write("?");
+  next_poll_ = Steady::now() + kPollPeriod;
+}
+
 std::string GrblStage::faultNow() const {
   if (alarm_ != 0) return grblAlarmName(alarm_);
   if (state_ == "Door") return "door open";
@@ -351,6 +372,7 @@ std::string GrblStage::faultNow() const {
 
 StageReading GrblStage::read() {
   listen(Steady::now(), [] { return false; });
+  if (homing_ && !critical()) watchHoming();
   if (!homing_ && !critical() && Steady::now() >= next_poll_) poll();
   if (!pending_.empty() && state_ == "Idle" && !move_unseen_) {
     const std::string line = std::exchange(pending_, {});
@@ -475,6 +497,9 @@ void GrblStage::startHoming() {
                      (alarm_ != 0 ? ": " + grblAlarmName(alarm_) : std::string()));
   }
   loseReference();
+  report_.reset();
+  reports_in_homing_ = 0;
+  next_poll_ = Steady::now() + kPollPeriod;
   homing_ = !answer.came;
   homed_ = answer.came;
 }

@@ -379,6 +379,25 @@ TEST_F(GrblStageTest, AResetLosesTheReference) {
   EXPECT_FALSE(after.moving);
 }
 
+TEST_F(GrblStageTest, AnUnheardEndOfHomingIsNoReference) {
+  plug();
+  const std::unique_ptr<Stage> stage = openHomed();
+  stage->moveTo(0.1, 1.0);
+  settle(*stage);
+  stage->home();
+  device_->setFaults({0.0, 1.0, 0.0});
+  const auto end = Steady::now() + std::chrono::seconds(30);
+  while (truth_->read().moving && Steady::now() < end) {
+    EXPECT_TRUE(stage->read().moving);
+    std::this_thread::sleep_for(std::chrono::milliseconds(2));
+  }
+  std::this_thread::sleep_for(std::chrono::milliseconds(100));
+  device_->setFaults({});
+  EXPECT_FALSE(settle(*stage).homed);
+  stage->home();
+  EXPECT_TRUE(settle(*stage).homed);
+}
+
 TEST_F(GrblStageTest, ReportsInInchesAndOfWorkPositionsAreMachinePositionsInMetres) {
   options_.inches = true;
   options_.work_positions = true;
