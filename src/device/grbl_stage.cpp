@@ -32,8 +32,12 @@ constexpr std::chrono::milliseconds kResetTime(2000);
 constexpr std::chrono::milliseconds kRefusalTime(100);
 constexpr int kHardLimit = 1, kSoftLimit = 2, kResetWhileMoving = 3, kHomingReset = 6;
 // Reports give micrometres; a motor's steps may be coarser [mm].
+constexpr double kAlike = 0.0006;
 constexpr double kSame = 0.02;
+// Of two reports in motion, where the largest speed is not known [mm].
 constexpr double kSameInMotion = 50.0;
+// A report in motion that fits the jog to so much of its way and so long [s] is taken at once.
+constexpr double kShareOfWay = 0.02, kTimeOfReport = 0.005;
 // A jog that was accepted shows in the reports after this.
 constexpr std::chrono::milliseconds kTimeToBegin(400);
 
@@ -75,6 +79,8 @@ class GrblStage : public SerialStage {
   /// A report has no checksum: whether it fits where the stage was and what it was told.
   enum class Fit { kCertain, kPossible, kContradiction };
   Fit fitOf(const GrblStatus& status, double position, Stamp stamp) const;
+  /// How far the stage gets in that time at most [mm].
+  std::optional<double> reach(double seconds) const;
   void startHoming();
   bool jogs() const;
   void replaceJog(const std::string& line);
@@ -112,6 +118,7 @@ class GrblStage : public SerialStage {
   bool moved_ = true;             ///< told to move since the last report at rest
   bool move_unseen_ = false;      ///< told to move since the last report
   std::optional<double> target_;  ///< of the jog under way [mm]
+  double feed_ = 0.0;             ///< of that jog [mm/s]
   Steady::time_point jog_at_;
   std::string pending_;  ///< what to send once the jog under way has braked
 };
@@ -272,18 +279,28 @@ std::optional<double> GrblStage::positionOf(const GrblStatus& status) const {
   return std::nullopt;
 }
 
+std::optional<double> GrblStage::reach(double seconds) const {
+  const auto rate = options_.find(110 + static_cast<int>(axis_));
+  if (rate == options_.end()) return std::nullopt;
+  return 1.1 * rate->second / 60.0 * seconds + kSame;
+}
+
 GrblStage::Fit GrblStage::fitOf(const GrblStatus& status, double position, Stamp stamp) const {
   if (!position_) return Fit::kPossible;
   const double distance = std::abs(position - *position_);
-  if (!moved_) return distance <= kSame ? Fit::kCertain : Fit::kContradiction;
-  const bool rests = !isMotion(status);
-  if (rests && target_ && std::abs(position - *target_) <= kSame) return Fit::kCertain;
-  const auto rate = options_.find(110 + static_cast<int>(axis_));
-  const double seconds = std::chrono::duration<double>(stamp - stamp_).count();
-  if (rate != options_.end() && distance > 1.1 * rate->second / 60.0 * seconds + kSame) {
-    return Fit::kContradiction;
+  if (!moved_) {
+    if (distance > kSame) return Fit::kContradiction;
+    return distance <= kAlike ? Fit::kCertain : Fit::kPossible;
   }
-  return rests ? Fit::kPossible : Fit::kCertain;
+  const bool rests = !isMotion(status);
+  if (rests && target_ && std::abs(position - *target_) <= kAlike) return Fit::kCertain;
+  const double seconds = std::chrono::duration<double>(stamp - stamp_).count();
+  if (distance > reach(seconds).value_or(distance)) return Fit::kContradiction;
+  if (rests || !target_) return Fit::kPossible;
+  const double way = feed_ * seconds;
+  const double expected = *position_ + std::copysign(way, *target_ - *position_);
+  const double slack = kShareOfWay * way + kTimeOfReport * feed_ + kSame;
+  return std::abs(position - expected) <= slack ? Fit::kCertain : Fit::kPossible;
 }
 
 void GrblStage::take(const GrblStatus& status, double position, Stamp stamp) {
@@ -307,6 +324,7 @@ void GrblStage::take(const GrblStatus& status, double position, Stamp stamp) {
 void GrblStage::poll() {
   listen(Steady::now(), [] { return false; });
   std::optional<double> doubtful;
+  Stamp doubtful_stamp;
   int silences = 0;
   for (int attempt = 0; attempt < kDoubts && silences < kSilences; ++attempt) {
     report_.reset();
@@ -325,10 +343,13 @@ void GrblStage::poll() {
     const std::optional<double> position = positionOf(*report_);
     if (!position) continue;
     const Fit fit = fitOf(*report_, *position, stamp);
-    const double tolerance = isMotion(*report_) ? kSameInMotion : kSame;
+    const double since = std::chrono::duration<double>(stamp - doubtful_stamp).count();
+    const double tolerance =
+        isMotion(*report_) ? reach(since + kTimeOfReport).value_or(kSameInMotion) : kSame;
     const bool confirmed = doubtful && std::abs(*doubtful - *position) <= tolerance;
     if (fit != Fit::kCertain && !confirmed) {
       doubtful = *position;
+      doubtful_stamp = stamp;
       continue;
     }
     // A reset whose banner was garbled, a hand on the carriage: whatever it was, it is elsewhere.
@@ -337,7 +358,8 @@ void GrblStage::poll() {
       loseReference();
     }
     take(*report_, *position, stamp);
-    next_poll_ = Steady::now() + kPollPeriod;
+    // Who was asked again is left alone for longer.
+    next_poll_ = Steady::now() + (attempt == 0 ? 1 : 2) * kPollPeriod;
     return;
   }
   throw StageError("the stage on " + printable(port_.path()) + " does not report its state");
@@ -420,6 +442,7 @@ void GrblStage::jog(const std::string& line) {
   next_poll_ = std::min(next_poll_, jog_at_ + kPollPeriod);
   const std::size_t axis = line.find_last_of("XYZ");
   target_ = parseNumber(line.substr(axis + 1, line.find(' ', axis) - axis - 1));
+  feed_ = parseNumber(line.substr(line.find_last_of('F') + 1)).value_or(0.0) / 60.0;
 }
 
 void GrblStage::moveTo(double position_m, double speed_mps) {
