@@ -80,13 +80,20 @@ void parallelFor(std::size_t begin, std::size_t end, int threads, const Body& bo
 #ifdef OMNISTER_THREAD_SANITIZER
   detail::parallelForOnThreads(begin, end, threadCount(threads), body, grain);
 #else
-  tbb::task_arena arena(threadCount(threads));
-  arena.execute([&] {
+  const auto run = [&] {
     tbb::parallel_for(tbb::blocked_range<std::size_t>(begin, end, grain),
                       [&](const tbb::blocked_range<std::size_t>& range) {
                         for (std::size_t i = range.begin(); i != range.end(); ++i) body(i);
                       });
-  });
+  };
+  const int count = threadCount(threads);
+  if (count == tbb::info::default_concurrency()) {
+    // The caller's own arena: workers that have just left it are still awake. Isolated, as a body
+    // that calls this again must not get to run another body of the outer call while it waits.
+    tbb::this_task_arena::isolate(run);
+  } else {
+    tbb::task_arena(count).execute(run);
+  }
 #endif
 }
 
