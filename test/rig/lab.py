@@ -6,6 +6,7 @@ import contextlib
 import glob
 import os
 import re
+import signal
 import socket
 import sys
 import tempfile
@@ -24,11 +25,13 @@ NODES = ['/rig', '/manager', '/stage/driver', '/camera/scan', '/watch']
 
 
 def own_network():
-    """Runs this program again in a network where nobody else's cameras and masters are. Returns there."""
+    """Runs this program again in a network where nobody else's cameras and masters are. Returns there; a program that is
+    asked to end then ends what it began."""
     foreign_camera.enter_own_network()
     if [name for _, name in socket.if_nameindex()] != ['lo']:
         print('skipped: a network of its own cannot be had here (unshare -n, ip)', file=sys.stderr)
         sys.exit(SKIPPED)
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
 
 def resources(pid):
@@ -147,7 +150,6 @@ class MachineClock:
         beside = self.file.with_suffix('.new')
         beside.write_text('%+d\n' % seconds)
         beside.rename(self.file)
-
 
 
 class Lab:
