@@ -144,6 +144,7 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   p.parent_frame_id = source.frame("parent_frame_id", "");
   p.mount = source.pose("mount", p.mount);
   p.retry_period_s = source.number("retry_period", p.retry_period_s, 0.05, 60.0, "s");
+  p.start_grace_s = source.number("start_grace", p.start_grace_s, 0.0, 60.0, "s");
   p.watchdog_s = source.number("watchdog", p.watchdog_s, 0.1, 600.0, "s");
   p.exit_on_error = source.flag("exit_on_error", false);
   p.stage_frame_id = source.frame("stage_frame_id", p.stage_frame_id);
@@ -296,6 +297,9 @@ void CameraDriver::tell(const std::string& problem) {
     failed_ = true;
     return;
   }
+  // What starts beside the camera, or with its power, may be there before it.
+  const std::chrono::duration<double> since_start = Steady::now() - started_;
+  if (!opened_once_ && since_start.count() < parameters_.start_grace_s) return;
   if (problem == told_problem_ && Steady::now() - told_at_ < kRepeatProblem) return;
   told_problem_ = problem;
   told_at_ = Steady::now();

@@ -57,6 +57,7 @@ struct CameraParameters {
   std::string parent_frame_id;    ///< carries <camera>_link; empty: no static tf
   Pose mount = Pose::Identity();  ///< T_parent_link
   double retry_period_s = 0.5;    ///< between attempts to open the device
+  double start_grace_s = 1.0;     ///< after the start; an absent device is told of later
   double diagnostic_period_s = kDiagnosticPeriod;
   double watchdog_s = 1.5;     ///< a device without a frame for so long is lost
   bool exit_on_error = false;  ///< the node ends instead of trying again
@@ -179,6 +180,7 @@ class CameraDriver {
   std::uint32_t published_ = 0;
   std::chrono::steady_clock::time_point last_frame_;
   ros::Time recorded_stamp_;
+  const std::chrono::steady_clock::time_point started_ = std::chrono::steady_clock::now();
   std::string told_problem_;
   std::chrono::steady_clock::time_point told_at_;
 
