@@ -524,7 +524,9 @@ void StereoPipeline::warnOfLeaps() {
   std::string reason;
   {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (std::exchange(leaps_, pairing_.leaps()) == leaps_) return;
+    const std::size_t leaps = pairing_.leaps();
+    if (leaps == leaps_) return;
+    leaps_ = leaps;
     reason = pairing_.reason();
   }
   warn("leap", reason);
