@@ -80,7 +80,7 @@ class AravisCamera : public Camera {
                                            nullptr, failure.out()));
     on_.refuseIf(failure, "no stream can be opened");
     if (ARV_IS_GV_STREAM(stream_.get())) tuneGigeStream();
-    for (int i = 0; i < settings_.buffers; ++i) pushNewBuffer();
+    for (int i = 0; i < settings_.buffers; ++i) pushIdleBuffer();
     clock_.prepare();
     arv_camera_start_acquisition(on_.camera(), failure.out());
     on_.refuseIf(failure, "it does not start");
@@ -226,15 +226,30 @@ class AravisCamera : public Camera {
     return sequence_;
   }
 
-  void pushNewBuffer() {
-    auto* memory = new FrameMemoryPtr(pool_->take(payload_));
-    arv_stream_push_buffer(
-        stream_.get(),
-        arv_buffer_new_full(payload_, (*memory)->bytes.data(), memory,
-                            [](gpointer p) { delete static_cast<FrameMemoryPtr*>(p); }));
+  /// The memory that a buffer fills, and keeps while it waits in the stream.
+  static FrameMemoryPtr& memoryOf(ArvBuffer* buffer) {
+    return *static_cast<FrameMemoryPtr*>(const_cast<void*>(arv_buffer_get_user_data(buffer)));
   }
 
-  /// Takes the buffer; one like it goes back into the stream.
+  /// Idle memory goes into the stream, in the buffer that it had before, if any.
+  void pushIdleBuffer() {
+    FrameMemoryPtr memory = pool_->take(payload_);
+    const std::shared_ptr<void> before = std::move(memory->wrapping);
+    auto* buffer = static_cast<ArvBuffer*>(before.get());
+    std::size_t bytes = 0;
+    if (buffer && arv_buffer_get_data(buffer, &bytes) == memory->bytes.data() &&
+        bytes == payload_) {
+      g_object_ref(buffer);
+    } else {
+      buffer =
+          arv_buffer_new_full(payload_, memory->bytes.data(), new FrameMemoryPtr,
+                              [](gpointer slot) { delete static_cast<FrameMemoryPtr*>(slot); });
+    }
+    memoryOf(buffer) = std::move(memory);
+    arv_stream_push_buffer(stream_.get(), buffer);
+  }
+
+  /// Takes the buffer; it or one like it goes back into the stream.
   std::optional<Frame> toFrame(ArvBuffer* buffer) {
     const auto payload_type = arv_buffer_get_payload_type(buffer);
     const bool image = payload_type == ARV_BUFFER_PAYLOAD_TYPE_IMAGE ||
@@ -272,13 +287,12 @@ class AravisCamera : public Camera {
     frame.number = arv_buffer_get_frame_id(buffer);
     frame.sequence = sequenceOf(frame.number);
     frame.region = region_;
-    const auto* memory = static_cast<const FrameMemoryPtr*>(arv_buffer_get_user_data(buffer));
     const bool whole_samples = step % CV_ELEM_SIZE1(format->type) == 0;
-    if (format->direct() && whole_samples && memory && (*memory)->bytes.data() == data) {
-      frame.memory = *memory;
+    if (format->direct() && whole_samples && memoryOf(buffer)->bytes.data() == data) {
+      frame.memory = std::move(memoryOf(buffer));
+      frame.memory->wrapping = std::shared_ptr<void>(buffer, g_object_unref);
       frame.image = cv::Mat(size, format->type, frame.memory->bytes.data(), step);
-      pushNewBuffer();
-      g_object_unref(buffer);
+      pushIdleBuffer();
     } else {
       frame.image = unpack(*format, data, size, step);
       arv_stream_push_buffer(stream_.get(), buffer);

@@ -4,21 +4,25 @@
 namespace omnister::device {
 
 FrameMemory::~FrameMemory() {
-  if (const std::shared_ptr<FramePool> pool = pool_.lock()) pool->giveBack(std::move(bytes));
+  if (const std::shared_ptr<FramePool> pool = pool_.lock()) {
+    pool->giveBack({std::move(bytes), std::move(wrapping)});
+  }
 }
 
 FrameMemoryPtr FramePool::take(std::size_t bytes) {
-  std::vector<std::uint8_t> memory;
+  Idle memory;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     if (!idle_.empty()) {
       memory = std::move(idle_.back());
       idle_.pop_back();
     }
-    if (memory.capacity() < bytes) ++allocated_;
+    if (memory.bytes.capacity() < bytes) ++allocated_;
   }
-  memory.resize(bytes);
-  return std::make_shared<FrameMemory>(std::move(memory), weak_from_this());
+  memory.bytes.resize(bytes);
+  auto frame = std::make_shared<FrameMemory>(std::move(memory.bytes), weak_from_this());
+  frame->wrapping = std::move(memory.wrapping);
+  return frame;
 }
 
 std::size_t FramePool::allocated() const {
@@ -26,9 +30,9 @@ std::size_t FramePool::allocated() const {
   return allocated_;
 }
 
-void FramePool::giveBack(std::vector<std::uint8_t> memory) {
+void FramePool::giveBack(Idle memory) {
   const std::lock_guard<std::mutex> lock(mutex_);
-  if (memory.capacity() > 0 && idle_.size() < keep_) idle_.push_back(std::move(memory));
+  if (memory.bytes.capacity() > 0 && idle_.size() < keep_) idle_.push_back(std::move(memory));
 }
 
 }  // namespace omnister::device

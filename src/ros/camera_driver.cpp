@@ -23,7 +23,9 @@ constexpr std::chrono::milliseconds kGrabTimeout(200);
 // An unplugged camera is told of once, and again now and then.
 constexpr std::chrono::seconds kRepeatProblem(30);
 constexpr std::chrono::seconds kPollStatistics(1);
-constexpr std::chrono::milliseconds kLookForListeners(50), kLookAfterDevice(250);
+constexpr std::chrono::milliseconds kLookForListeners(50), kLookForLast(250);
+// Rates are counted over so long at least [s].
+constexpr double kStretch = 0.4;
 // Frames that stay away for so long, and for four of their intervals, are a problem [s].
 constexpr double kSilent = 0.7;
 // A service waits so long for the device; what is asked for is done later all the same.
@@ -165,12 +167,11 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
     : node_(callbacks_.on(node)),
       parameters_(std::move(parameters)),
       open_(std::move(open)),
-      last_report_(Steady::now()),
+      stretch_began_(Steady::now()),
       settings_(parameters_.settings),
       last_frame_(Steady::now()),
       private_node_(callbacks_.on(private_node)),
-      diagnostics_(node, private_node, private_node.getNamespace()),
-      pace_(parameters_.diagnostic_period_s) {
+      diagnostics_(node, private_node, private_node.getNamespace()) {
   lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
   if (!parameters_.lens.empty()) setLens(readLensFile(parameters_.lens));
   if (!parameters_.parent_frame_id.empty()) {
@@ -189,9 +190,8 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
   trigger_ = node_.advertiseService("trigger", &CameraDriver::onTrigger, this);
-  timer_ = node_.createSteadyTimer(
-      ros::WallDuration(std::chrono::duration<double>(kLookAfterDevice).count()),
-      [this](const ros::SteadyTimerEvent&) { onTimer(); });
+  timer_ = node_.createSteadyTimer(ros::WallDuration(parameters_.diagnostic_period_s),
+                                   [this](const ros::SteadyTimerEvent&) { report(); });
   thread_ = std::thread(&CameraDriver::run, this);
   pthread_setname_np(thread_.native_handle(), "camera");
   callbacks_.start();
@@ -228,7 +228,7 @@ bool CameraDriver::wanted() {
   // Asking goes through the publishers of every transport: not for each frame.
   if (Steady::now() >= wanted_due_) {
     wanted_ = images_.getNumSubscribers() > 0;
-    wanted_due_ = Steady::now() + kLookForListeners;
+    wanted_due_ = Steady::now() + (wanted_ ? kLookForLast : kLookForListeners);
   }
   return wanted_;
 }
@@ -253,6 +253,17 @@ void CameraDriver::run() {
   }
 }
 
+void CameraDriver::setState(const std::string& state, const std::string& problem) {
+  bool changed = false;
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    changed = state != state_ || problem.empty() != problem_.empty();
+    state_ = state;
+    problem_ = problem;
+  }
+  if (changed) reportSoon();
+}
+
 void CameraDriver::openIfNeeded() {
   if (camera_) return;
   CameraParameters wanted = parameters_;
@@ -263,10 +274,9 @@ void CameraDriver::openIfNeeded() {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     identity_ = identity;
-    problem_.clear();
-    state_ = "idle";
     opened_once_ = true;
   }
+  setState("idle", "");
   ROS_INFO_STREAM("opened " << printable(describe(identity)));
   last_sequence_.reset();
   streamed_ = false;
@@ -280,10 +290,9 @@ void CameraDriver::openIfNeeded() {
 void CameraDriver::close(const std::string& problem) {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
-    state_ = "lost";
-    problem_ = problem;
     ++losses_of_device_;
   }
+  setState("lost", problem);
   tell(problem);
   // Takes seconds where the device does not answer.
   if (camera_) camera_->abandon();
@@ -308,15 +317,11 @@ void CameraDriver::tell(const std::string& problem) {
 }
 
 void CameraDriver::stream() {
-  const auto setState = [this](const char* state) {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    state_ = state;
-  };
   if (camera_->finished()) {
     if (streaming_) {
       camera_->stop();
       streaming_ = false;
-      setState("finished");
+      setState("finished", "");
       ROS_INFO("the recording is over");
     }
     waitFor(0.1);
@@ -326,7 +331,7 @@ void CameraDriver::stream() {
     if (streaming_) {
       camera_->stop();
       streaming_ = false;
-      setState("idle");
+      setState("idle", "");
       ROS_DEBUG("nobody listens, streaming stops");
     }
     waitFor(std::chrono::duration<double>(kLookForListeners).count());
@@ -337,11 +342,10 @@ void CameraDriver::stream() {
     streaming_ = true;
     streamed_ = false;
     last_frame_ = Steady::now();
-    setState("streaming");
+    setState("streaming", "");
     ROS_DEBUG("streaming");
   }
   const std::optional<device::Frame> frame = camera_->grab(kGrabTimeout);
-  takeRemarks();
   if (frame) {
     countLost(*frame);
     if (streamed_) interval_s_ = secondsSince(last_frame_);
@@ -359,8 +363,8 @@ void CameraDriver::watch() {
   if (silent <= std::max(parameters_.watchdog_s, slowest_s_)) {
     // Said before it is acted upon, as the frames came until now.
     if (streamed_ && silent > std::max({kSilent, 4.0 * interval_s_, slowest_s_})) {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      problem_ = "no frame since " + formatNumber(std::round(10.0 * silent) / 10.0) + " s";
+      setState("streaming",
+               "no frame since " + formatNumber(std::round(10.0 * silent) / 10.0) + " s");
     }
     return;
   }
@@ -383,10 +387,7 @@ void CameraDriver::watch() {
     torn_ = torn;
     last_frame_ = Steady::now();
   }
-  {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    problem_ = problem.str();
-  }
+  setState("streaming", problem.str());
   ROS_WARN_STREAM_THROTTLE(10.0, problem.str());
 }
 
@@ -404,6 +405,7 @@ void CameraDriver::pollStatistics() {
   if (streaming_ && streamed_ && secondsSince(last_frame_) > 0.5 * kSilent) return;
   if (Steady::now() < statistics_due_) return;
   statistics_due_ = Steady::now() + kPollStatistics;
+  takeRemarks();
   const device::CameraStatistics statistics = camera_->statistics();
   // Only what is torn while nothing else comes counts for the watchdog.
   if (secondsSince(last_frame_) < kPollStatistics.count()) torn_ = statistics.incomplete;
@@ -416,9 +418,12 @@ void CameraDriver::takeControls(const device::CameraControls& controls) {
   slowest_s_ = controls.exposure_us.value_or(0.0) * 2e-6;
   const double rate = controls.frame_rate_hz.value_or(settings_.frame_rate_hz);
   if (rate > 0.0) slowest_s_ = std::max(slowest_s_, 3.0 / rate);
-  const std::lock_guard<std::mutex> lock(mutex_);
-  controls_ = controls;
-  controls_changed_ = true;
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    controls_ = controls;
+    controls_changed_ = true;
+  }
+  reportSoon();
 }
 
 void CameraDriver::callDevice(const Task& task) {
@@ -515,7 +520,11 @@ void CameraDriver::configure(CameraConfig& config) {
   config_ = config;
 }
 
-void CameraDriver::onTimer() {
+void CameraDriver::reportSoon() {
+  callbacks_.post([this] { report(); });
+}
+
+void CameraDriver::report() {
   bool opened = false;
   bool changed = false;
   device::CameraControls controls;
@@ -545,7 +554,7 @@ void CameraDriver::onTimer() {
     fromControls(controls, &config_);
     config_server_->updateConfig(config_);
   }
-  if (pace_.due()) diagnostics_.force_update();
+  diagnostics_.force_update();
 }
 
 void CameraDriver::countLost(const device::Frame& frame) {
@@ -554,11 +563,16 @@ void CameraDriver::countLost(const device::Frame& frame) {
                                 : 0;
   last_sequence_ = frame.sequence;
   told_problem_.clear();
-  const std::lock_guard<std::mutex> lock(mutex_);
-  ++frames_;
-  lost_ += gap;
-  last_number_ = frame.number;
-  problem_.clear();
+  bool back = false;
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    ++frames_;
+    lost_ += gap;
+    last_number_ = frame.number;
+    back = !problem_.empty();
+    problem_.clear();
+  }
+  if (back) reportSoon();
 }
 
 void CameraDriver::publish(const device::Frame& frame) {
@@ -783,20 +797,21 @@ bool CameraDriver::rollBackLens(RollBackLens::Request& request, RollBackLens::Re
 void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
   using diagnostic_msgs::DiagnosticStatus;
   const std::lock_guard<std::mutex> lock(mutex_);
-  const double seconds = secondsSince(last_report_);
-  const double rate =
-      seconds > 0.0 ? static_cast<double>(frames_ - frames_at_last_report_) / seconds : 0.0;
-  const std::uint64_t lost = lost_ - lost_at_last_report_;
-  frames_at_last_report_ = frames_;
-  lost_at_last_report_ = lost_;
-  last_report_ = Steady::now();
+  const double seconds = secondsSince(stretch_began_);
+  if (seconds >= kStretch) {
+    rate_hz_ = static_cast<double>(frames_ - frames_then_) / seconds;
+    lost_lately_ = lost_ - lost_then_;
+    frames_then_ = frames_;
+    lost_then_ = lost_;
+    stretch_began_ = Steady::now();
+  }
   if (state_ == "lost" || state_ == "opening") {
     status.summary(DiagnosticStatus::ERROR, state_ == "lost" ? "no camera" : "opening the camera");
   } else if (!problem_.empty()) {
     status.summary(DiagnosticStatus::ERROR, problem_);
-  } else if (lost > 0) {
+  } else if (lost_lately_ > 0) {
     status.summary(DiagnosticStatus::WARN,
-                   "frames get lost: " + std::to_string(lost) + " just now");
+                   "frames get lost: " + std::to_string(lost_lately_) + " just now");
   } else if (!lens_ && !lens_problem_.empty()) {
     status.summary(DiagnosticStatus::WARN, "the stored calibration cannot be used");
   } else {
@@ -808,7 +823,7 @@ void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status)
   status.add("frames published", frames_);
   status.add("frames lost", lost_);
   status.add("number of the last frame", last_number_);
-  status.add("rate [Hz]", rate);
+  status.add("rate [Hz]", rate_hz_);
   status.add("frames incomplete", statistics_.incomplete);
   status.add("frames without memory", statistics_.underruns);
   status.add("packets missing", statistics_.missing_packets);

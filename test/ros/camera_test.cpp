@@ -288,6 +288,22 @@ TEST_F(CameraTest, DiagnosticsCountLostFrames) {
   EXPECT_EQ(diagnosed(diagnostics, "state"), "streaming");
 }
 
+TEST_F(CameraTest, DiagnosticsTellOfAChangeAtOnce) {
+  parameters_.diagnostic_period_s = 3600.0;
+  Collector<diagnostic_msgs::DiagnosticArray> diagnostics(ros::NodeHandle(), "/diagnostics");
+  openFake();
+  const auto comes = [&](const std::string& state) {
+    return eventually([&] { return diagnosed(diagnostics, "state") == state; });
+  };
+  EXPECT_TRUE(comes("idle"));
+  Collector<sensor_msgs::Image> images(node_, "image_raw");
+  EXPECT_TRUE(comes("streaming"));
+  state_.unplugged = true;
+  EXPECT_TRUE(comes("lost"));
+  state_.unplugged = false;
+  EXPECT_TRUE(comes("streaming"));
+}
+
 TEST_F(CameraTest, PublishesTheLensOfItsParameter) {
   const LensFile file = lens();
   parameters_.lens = (folder_.path() / "lens.yaml").string();

@@ -25,6 +25,9 @@ class FrameMemory {
   FrameMemory& operator=(const FrameMemory&) = delete;
 
   std::vector<std::uint8_t> bytes;
+  /// What a device made around the bytes, good for as long as these stay where they are; kept with
+  /// them, so that it need not be made for each frame.
+  std::shared_ptr<void> wrapping;
 
  private:
   std::weak_ptr<FramePool> pool_;
@@ -38,7 +41,7 @@ class FramePool : public std::enable_shared_from_this<FramePool> {
   static std::shared_ptr<FramePool> make(std::size_t keep) {
     return std::shared_ptr<FramePool>(new FramePool(keep));
   }
-  /// Memory of that size, of unknown content.
+  /// Memory of that size, of unknown content, and what was around it if it was in use before.
   FrameMemoryPtr take(std::size_t bytes);
   /// Memories that had to be allocated so far.
   std::size_t allocated() const;
@@ -46,11 +49,15 @@ class FramePool : public std::enable_shared_from_this<FramePool> {
  private:
   friend class FrameMemory;
   explicit FramePool(std::size_t keep) : keep_(keep) {}
-  void giveBack(std::vector<std::uint8_t> memory);
+  struct Idle {
+    std::vector<std::uint8_t> bytes;
+    std::shared_ptr<void> wrapping;
+  };
+  void giveBack(Idle memory);
 
   const std::size_t keep_;
   mutable std::mutex mutex_;
-  std::vector<std::vector<std::uint8_t>> idle_;
+  std::vector<Idle> idle_;
   std::size_t allocated_ = 0;
 };
 

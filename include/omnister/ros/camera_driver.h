@@ -40,7 +40,6 @@
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_store.h"
 #include "omnister/ros/callback_threads.h"
-#include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/static_frames.h"
 
@@ -54,13 +53,13 @@ struct CameraParameters {
   std::string store;                        ///< folder of calibrations, see LensStore
   std::string name;                         ///< of this camera in the store; empty: its serial
   device::CameraSettings settings;
-  std::string parent_frame_id;    ///< carries <camera>_link; empty: no static tf
-  Pose mount = Pose::Identity();  ///< T_parent_link
-  double retry_period_s = 0.5;    ///< between attempts to open the device
-  double start_grace_s = 1.0;     ///< after the start; an absent device is told of later
-  double diagnostic_period_s = kDiagnosticPeriod;
-  double watchdog_s = 1.5;     ///< a device without a frame for so long is lost
-  bool exit_on_error = false;  ///< the node ends instead of trying again
+  std::string parent_frame_id;       ///< carries <camera>_link; empty: no static tf
+  Pose mount = Pose::Identity();     ///< T_parent_link
+  double retry_period_s = 0.5;       ///< between attempts to open the device
+  double start_grace_s = 1.0;        ///< after the start; an absent device is told of later
+  double diagnostic_period_s = 1.0;  ///< changes are told at once
+  double watchdog_s = 1.5;           ///< a device without a frame for so long is lost
+  bool exit_on_error = false;        ///< the node ends instead of trying again
   // Of a recording that knows stage positions:
   std::string stage_frame_id = "stage_base";
   std::string stage_child_frame_id = "stage_carriage";
@@ -99,6 +98,7 @@ class CameraDriver {
   void run();
   void stream();
   void openIfNeeded();
+  void setState(const std::string& state, const std::string& problem);
   void close(const std::string& problem);
   void tell(const std::string& problem);
   bool wanted();
@@ -117,7 +117,10 @@ class CameraDriver {
   void runTasks();
 
   /// What must not wait for the device: diagnostics, and the configuration as the device took it.
-  void onTimer();
+  void report();
+  /// Reports at once, by another thread: the device was found or lost, frames stay away or are
+  /// back.
+  void reportSoon();
   void configure(CameraConfig& config);
   bool onTrigger(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   void takeControls(const device::CameraControls& controls);
@@ -150,20 +153,23 @@ class CameraDriver {
   std::string published_lens_;
   std::string lens_problem_;  // why there is none, where the store holds one
   device::CameraIdentity identity_;
-  std::string state_ = "opening";
+  std::string state_ = "opening";  // by setState(), which reports
   std::string problem_;
   std::uint64_t frames_ = 0;
   std::uint64_t lost_ = 0;
   std::uint64_t last_number_ = 0;
   std::uint64_t losses_of_device_ = 0;
-  std::uint64_t frames_at_last_report_ = 0;
-  std::uint64_t lost_at_last_report_ = 0;
+  // The last stretch of diagnostics.
+  std::uint64_t frames_then_ = 0;
+  std::uint64_t lost_then_ = 0;
+  std::uint64_t lost_lately_ = 0;
+  double rate_hz_ = 0.0;
   device::CameraStatistics statistics_;
   device::CameraControls controls_;
   bool opened_once_ = false;
   bool controls_changed_ = false;
   std::deque<std::packaged_task<void(device::Camera*)>> tasks_;
-  std::chrono::steady_clock::time_point last_report_;
+  std::chrono::steady_clock::time_point stretch_began_;
 
   // Of the device thread.
   std::unique_ptr<device::Camera> camera_;
@@ -201,7 +207,6 @@ class CameraDriver {
   bool config_ready_ = false;
   ros::SteadyTimer timer_;
   diagnostic_updater::Updater diagnostics_;
-  DiagnosticPace pace_;
   std::atomic<bool> stop_{false};
   std::atomic<bool> failed_{false};
   std::thread thread_;
