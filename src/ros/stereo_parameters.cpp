@@ -16,6 +16,31 @@ namespace {
 /// Frames that may be needed to find `positions` places.
 std::size_t historyFor(int positions) { return static_cast<std::size_t>(positions) + 7; }
 
+/// `visit(live, kept)` for every value that is the same in both.
+template <typename Config, typename Kept, typename Visit>
+void eachLiveValue(Config& config, Kept& parameters, const Visit& visit) {
+  visit(config.preset, parameters.preset);
+  visit(config.min_baseline, parameters.pairing.min_baseline);
+  visit(config.max_baseline, parameters.pairing.max_baseline);
+  visit(config.positions, parameters.pairing.positions);
+  visit(config.min_range, parameters.matching.min_range);
+  visit(config.max_range, parameters.matching.max_range);
+  visit(config.hypotheses, parameters.matching.hypotheses);
+  visit(config.matcher, parameters.matcher);
+  visit(config.cost, parameters.cost);
+  visit(config.window, parameters.window);
+  visit(config.refine, parameters.matching.refine);
+  visit(config.mask, parameters.mask);
+  visit(config.roi, parameters.region);
+  visit(config.reduce, parameters.reduce);
+  visit(config.use_prior, parameters.use_prior);
+  visit(config.stream, parameters.stream);
+  visit(config.epipolar_pixels, parameters.epipolar_pixels);
+}
+
+/// A rate's period and a period's rate; 0: no limit.
+double inverse(double value) { return value > 0.0 ? 1.0 / value : 0.0; }
+
 }  // namespace
 
 cv::Mat loadMask(const std::string& path) {
@@ -56,49 +81,17 @@ void settlePreset(StereoConfig& config, const StereoConfig& before) {
 
 StereoConfig toConfig(const StereoParameters& parameters) {
   StereoConfig config = StereoConfig::__getDefault__();
-  config.preset = parameters.preset;
-  config.min_baseline = parameters.pairing.min_baseline;
-  config.max_baseline = parameters.pairing.max_baseline;
-  config.positions = parameters.pairing.positions;
-  config.min_range = parameters.matching.min_range;
-  config.max_range = parameters.matching.max_range;
-  config.hypotheses = parameters.matching.hypotheses;
-  config.matcher = parameters.matcher;
-  config.cost = parameters.cost;
-  config.window = parameters.window;
-  config.refine = parameters.matching.refine;
-  config.mask = parameters.mask;
-  config.roi = parameters.region;
-  config.reduce = parameters.reduce;
-  config.use_prior = parameters.use_prior;
-  config.stream = parameters.stream;
-  config.max_rate = parameters.min_period > 0.0 ? 1.0 / parameters.min_period : 0.0;
-  config.epipolar_pixels = parameters.epipolar_pixels;
+  eachLiveValue(config, parameters, [](auto& live, const auto& kept) { live = kept; });
+  config.max_rate = inverse(parameters.min_period);
   return config;
 }
 
 void take(const StereoConfig& config, StereoParameters& parameters) {
-  parameters.preset = config.preset;
-  parameters.pairing.min_baseline = config.min_baseline;
-  parameters.pairing.max_baseline = config.max_baseline;
-  parameters.pairing.positions = config.positions;
+  eachLiveValue(config, parameters, [](const auto& live, auto& kept) { kept = live; });
+  parameters.min_period = inverse(config.max_rate);
   parameters.pairing.history = historyFor(config.positions);
-  parameters.matching.min_range = config.min_range;
-  parameters.matching.max_range = config.max_range;
-  parameters.matching.hypotheses = config.hypotheses;
-  parameters.matcher = config.matcher;
-  parameters.cost = config.cost;
-  parameters.window = config.window;
   parameters.matching.cost = parseMatchCost(config.cost);
   parameters.matching.window = parseMatchWindow(config.window);
-  parameters.matching.refine = config.refine;
-  parameters.mask = config.mask;
-  parameters.region = config.roi;
-  parameters.reduce = config.reduce;
-  parameters.use_prior = config.use_prior;
-  parameters.stream = config.stream;
-  parameters.min_period = config.max_rate > 0.0 ? 1.0 / config.max_rate : 0.0;
-  parameters.epipolar_pixels = config.epipolar_pixels;
 }
 
 WorkerSettings settingsOf(const StereoParameters& parameters) {
@@ -151,8 +144,8 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   result.stream = parameters.flag("stream", false);
   if (result.stream && result.rig)
     throw InputError("~stream", "", "is for one camera that moves, not for mode rig");
-  const double rate = parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)");
-  result.min_period = rate > 0.0 ? 1.0 / rate : 0.0;
+  result.min_period =
+      inverse(parameters.number("max_rate", 0.0, 0.0, 1000.0, "Hz (0: as fast as it goes)"));
   result.matcher = parameters.choice("matcher", "sweep", {"sweep", "thesis"});
   result.preset = parameters.choice("preset", "custom", presetNames());
   result.drift = loadDriftParameters(parameters);

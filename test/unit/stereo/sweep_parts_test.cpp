@@ -374,6 +374,30 @@ TEST_P(EverySet, SamplesBetweenPixels) {
   EXPECT_EQ(grey[kRuns * 8], 77) << "written past the end";
 }
 
+/// A piece of an image to match, and where its results go: one for each pixel with a whole window.
+struct Chunk {
+  Chunk(int width, int height, int stride, const std::vector<std::int32_t>& base)
+      : inner((width - 2 * kRadius) * (height - 2 * kRadius)) {
+    job.width = width;
+    job.height = height;
+    job.stride = stride;
+    job.base = base.data();
+    job.cost = cost.data();
+    job.index = index.data();
+    job.before = before.data();
+    job.after = after.data();
+    job.scratch = &scratch;
+  }
+
+  const std::size_t inner;
+  std::vector<std::uint16_t> cost = std::vector<std::uint16_t>(inner, 0xFFFF);
+  std::vector<std::uint16_t> before = std::vector<std::uint16_t>(inner);
+  std::vector<std::uint16_t> after = std::vector<std::uint16_t>(inner);
+  std::vector<std::int16_t> index = std::vector<std::int16_t>(inner);
+  std::vector<std::uint8_t> scratch;
+  ChunkJob job;
+};
+
 TEST_P(EverySet, MatchingFindsTheLeastBoxOfBits) {
   std::mt19937 random(11);
   constexpr int kWidth = 21, kHeight = 13, kCells = 4000;
@@ -389,24 +413,12 @@ TEST_P(EverySet, MatchingFindsTheLeastBoxOfBits) {
     plane.resize(base.size());
     for (auto& byte : plane) byte = static_cast<std::uint8_t>(random());
   }
-  constexpr int kInner = (kWidth - 2 * kRadius) * (kHeight - 2 * kRadius);
-  std::vector<std::uint16_t> cost(kInner), before(kInner), after(kInner);
-  std::vector<std::int16_t> index(kInner);
-  std::vector<std::uint8_t> scratch;
-  ChunkJob job;
-  job.width = kWidth;
-  job.height = kHeight;
-  job.stride = kStride;
-  job.base = base.data();
+  Chunk chunk(kWidth, kHeight, kStride, base);
+  ChunkJob& job = chunk.job;
   for (int p = 0; p < kPlanes; ++p) {
     job.reference[p] = reference[p].data();
     job.cells[p] = cells[p].data();
   }
-  job.cost = cost.data();
-  job.index = index.data();
-  job.before = before.data();
-  job.after = after.data();
-  job.scratch = &scratch;
   // Three chunks that join: hypotheses -8 to 5, 6 to 35 and 36 to 49.
   const std::pair<int, int> chunks[] = {{-9, 16}, {5, 32}, {35, 16}};
   job.fresh = true;
@@ -431,10 +443,10 @@ TEST_P(EverySet, MatchingFindsTheLeastBoxOfBits) {
       for (int k = -8; k <= 49; ++k)
         if (box(k) < box(best)) best = k;
       const int i = y * (kWidth - 2 * kRadius) + x;
-      ASSERT_EQ(index[i], best);
-      ASSERT_EQ(cost[i], box(best));
-      ASSERT_EQ(before[i], box(best - 1));
-      ASSERT_EQ(after[i], box(best + 1));
+      ASSERT_EQ(chunk.index[i], best);
+      ASSERT_EQ(chunk.cost[i], box(best));
+      ASSERT_EQ(chunk.before[i], box(best - 1));
+      ASSERT_EQ(chunk.after[i], box(best + 1));
     }
   }
 }
@@ -451,22 +463,10 @@ TEST_P(EverySet, CorrelationsAreThoseOfTheirFormulas) {
   for (auto& b : base) b = static_cast<std::int32_t>(64 + random() % (kCells - 200));
   // Windows without contrast, here and there.
   for (int y = 0; y < 8; ++y) std::fill_n(&reference[y * kStride], 9, std::uint8_t{77});
-  constexpr int kInner = (kWidth - 2 * kRadius) * (kHeight - 2 * kRadius);
-  std::vector<std::uint16_t> cost(kInner, 0xFFFF), before(kInner), after(kInner);
-  std::vector<std::int16_t> index(kInner);
-  std::vector<std::uint8_t> scratch;
-  ChunkJob job;
-  job.width = kWidth;
-  job.height = kHeight;
-  job.stride = kStride;
-  job.base = base.data();
+  Chunk chunk(kWidth, kHeight, kStride, base);
+  ChunkJob& job = chunk.job;
   job.reference[0] = reference.data();
   job.cells[0] = cells.data();
-  job.cost = cost.data();
-  job.index = index.data();
-  job.before = before.data();
-  job.after = after.data();
-  job.scratch = &scratch;
   for (const bool without_mean : {true, false}) {
     job.fresh = true;
     for (const auto& [first, lanes] : {std::pair(-9, 16), std::pair(5, 32)}) {
@@ -509,15 +509,15 @@ TEST_P(EverySet, CorrelationsAreThoseOfTheirFormulas) {
         const int i = y * (kWidth - 2 * kRadius) + x;
         plain += variance < kLeastVariance;
         if (variance < kLeastVariance) {
-          ASSERT_EQ(cost[i], 32767);
+          ASSERT_EQ(chunk.cost[i], 32767);
           continue;
         }
         double best = costOf(-8);
         for (int k = -8; k <= 35; ++k) best = std::min(best, costOf(k));
-        ASSERT_NEAR(cost[i], std::min(best, 32767.0), 2) << x << " " << y;
-        ASSERT_NEAR(cost[i], std::min(costOf(index[i]), 32767.0), 2);
-        ASSERT_NEAR(before[i], std::min(costOf(index[i] - 1), 32767.0), 2);
-        ASSERT_NEAR(after[i], std::min(costOf(index[i] + 1), 32767.0), 2);
+        ASSERT_NEAR(chunk.cost[i], std::min(best, 32767.0), 2) << x << " " << y;
+        ASSERT_NEAR(chunk.cost[i], std::min(costOf(chunk.index[i]), 32767.0), 2);
+        ASSERT_NEAR(chunk.before[i], std::min(costOf(chunk.index[i] - 1), 32767.0), 2);
+        ASSERT_NEAR(chunk.after[i], std::min(costOf(chunk.index[i] + 1), 32767.0), 2);
       }
     }
     EXPECT_GT(plain, 0);
