@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/calibration/rig_file.h"
 
-#include <yaml-cpp/yaml.h>
-
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <set>
 
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/yaml_text.h"
 
 namespace omnister {
 
@@ -46,11 +46,13 @@ class RigReader {
   RigFile read() const {
     static const std::array<std::string, 7> kKeys = {
         "version", "reference", "displaced", "T_ref_disp", "baseline_m", "rms_px", "date"};
+    std::set<std::string> seen;
     for (const auto& entry : rig_) {
       const std::string key = entry.first.IsScalar() ? entry.first.Scalar() : "";
       if (std::find(kKeys.begin(), kKeys.end(), key) == kKeys.end()) {
         refuse(printable(key, 60), "is unknown");
       }
+      if (!seen.insert(key).second) refuse(key, "stands there twice");
     }
     if (!rig_["version"]) refuse("version", "is missing, expected 1");
     if (number("version", rig_["version"]) != 1.0) {
@@ -104,16 +106,12 @@ std::string quotedYaml(const std::string& text) {
 }  // namespace
 
 RigFile parseRigFile(std::string_view text, std::string_view source) {
-  try {
-    const YAML::Node root = YAML::Load(std::string(text));
+  return readYaml(text, source, [&](const YAML::Node& root) {
     if (!root.IsMap() || !root["rig"] || !root["rig"].IsMap()) {
       throw InputError(source, "", "has no block 'rig', expected a rig file");
     }
     return RigReader(root["rig"], source).read();
-  } catch (const YAML::Exception& error) {
-    throw InputError(source, "line " + std::to_string(error.mark.line + 1),
-                     "is not YAML: " + printable(error.msg, 100));
-  }
+  });
 }
 
 RigFile readRigFile(const std::filesystem::path& path) {

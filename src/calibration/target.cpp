@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/calibration/target.h"
 
-#include <yaml-cpp/yaml.h>
-
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -13,6 +11,7 @@
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/yaml_text.h"
 #include "tag_families.h"
 
 namespace omnister {
@@ -222,14 +221,7 @@ void checkTarget(const Target& target, std::string_view source) {
 }
 
 Target parseTarget(std::string_view text, std::string_view source) {
-  YAML::Node root;
-  try {
-    root = YAML::Load(std::string(text));
-  } catch (const YAML::Exception& error) {
-    throw InputError(source,
-                     error.mark.is_null() ? "" : "line " + std::to_string(error.mark.line + 1),
-                     "is not YAML: " + error.msg);
-  }
+  const YAML::Node root = readYaml(text, source, [](const YAML::Node& node) { return node; });
   if (!root.IsMap()) {
     throw InputError(
         source, "",

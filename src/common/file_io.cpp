@@ -95,6 +95,13 @@ std::string readFile(const fs::path& path, std::size_t max_bytes) {
   struct stat info {};
   if (::fstat(fd.get(), &info) != 0) throw IoError("read", path.string(), errno);
   if (!S_ISREG(info.st_mode)) throw InputError(path.string(), "", "is not a regular file");
+  const auto limit = [&](std::size_t size) {
+    if (size <= max_bytes) return;
+    throw InputError(path.string(), "",
+                     "is larger than the limit of " + std::to_string(max_bytes) + " bytes");
+  };
+  // Before any of it is read; some files, as in /proc, say that they are empty.
+  limit(static_cast<std::size_t>(info.st_size));
   std::string bytes;
   char buffer[1 << 16];
   for (;;) {
@@ -105,10 +112,7 @@ std::string readFile(const fs::path& path, std::size_t max_bytes) {
     }
     if (n == 0) return bytes;
     bytes.append(buffer, static_cast<std::size_t>(n));
-    if (bytes.size() > max_bytes) {
-      throw InputError(path.string(), "",
-                       "is larger than the limit of " + std::to_string(max_bytes) + " bytes");
-    }
+    limit(bytes.size());
   }
 }
 

@@ -1,10 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/common/image_file.h"
 
+#include <fcntl.h>
+#include <unistd.h>
+
 #include <algorithm>
+#include <atomic>
 #include <cctype>
 #include <cstdint>
 #include <cstdlib>
+#include <mutex>
 #include <opencv2/imgcodecs.hpp>
 #include <optional>
 #include <string>
@@ -120,7 +125,40 @@ std::optional<Header> tiffHeader(std::string_view data) {
   return header;
 }
 
+std::atomic<bool> decoders_are_silent{false};
+
+/// Standard error leads nowhere while there is one of these, where that is asked for.
+class SilentStandardError {
+ public:
+  SilentStandardError() {
+    if (!wanted_) return;
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (users_++ > 0) return;
+    const int nowhere = ::open("/dev/null", O_WRONLY | O_CLOEXEC);
+    saved_ = ::fcntl(STDERR_FILENO, F_DUPFD_CLOEXEC, STDERR_FILENO + 1);
+    if (saved_ >= 0 && nowhere >= 0) ::dup2(nowhere, STDERR_FILENO);
+    if (nowhere >= 0) ::close(nowhere);
+  }
+  ~SilentStandardError() {
+    if (!wanted_) return;
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (--users_ > 0 || saved_ < 0) return;
+    ::dup2(saved_, STDERR_FILENO);
+    ::close(saved_);
+  }
+  SilentStandardError(const SilentStandardError&) = delete;
+  SilentStandardError& operator=(const SilentStandardError&) = delete;
+
+ private:
+  const bool wanted_ = decoders_are_silent;
+  static inline std::mutex mutex_;
+  static inline int users_ = 0;
+  static inline int saved_ = -1;
+};
+
 }  // namespace
+
+void silenceDecoders() { decoders_are_silent = true; }
 
 cv::Mat readImage(const std::filesystem::path& path, ImageColor color, std::size_t max_pixels) {
   const std::string data = readFile(path);
@@ -146,6 +184,7 @@ cv::Mat readImage(const std::filesystem::path& path, ImageColor color, std::size
   if (color == ImageColor::kAsIs) flags = cv::IMREAD_UNCHANGED;
   cv::Mat image;
   try {
+    const SilentStandardError silence;
     image = cv::imdecode(
         cv::Mat(1, static_cast<int>(data.size()), CV_8UC1, const_cast<char*>(data.data())), flags);
   } catch (const cv::Exception& error) {

@@ -1,17 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/device/replay_camera.h"
 
-#include <yaml-cpp/yaml.h>
-
 #include <algorithm>
 #include <cctype>
 #include <cmath>
-#include <opencv2/imgcodecs.hpp>
 #include <set>
 #include <thread>
 
 #include "omnister/common/file_io.h"
+#include "omnister/common/image_file.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/yaml_text.h"
 
 namespace omnister::device {
 namespace {
@@ -122,8 +121,10 @@ class Reader {
 
   void checkKeys(const YAML::Node& map, const std::string& prefix,
                  const std::set<std::string>& known) const {
+    std::set<std::string> seen;
     for (const auto& item : map) {
       const std::string key = item.first.IsScalar() ? item.first.Scalar() : "?";
+      if (!seen.insert(key).second) refuse(prefix + printable(key), "stands there twice");
       if (known.count(key) > 0) continue;
       std::string list;
       for (const std::string& name : known) list += (list.empty() ? "" : ", ") + name;
@@ -290,27 +291,26 @@ class ReplayCamera : public Camera {
 
   std::optional<Frame> load(const Recording::Entry& entry) {
     Frame frame;
+    const std::string name = printable(entry.image.string());
     std::string problem;
     try {
-      frame.image =
-          cv::imread(entry.image.string(), cv::IMREAD_UNCHANGED | cv::IMREAD_IGNORE_ORIENTATION);
-      if (frame.image.empty()) problem = "cannot be read as an image";
-    } catch (const cv::Exception& e) {
-      problem = "cannot be read as an image: " + e.err;
+      frame.image = readImage(entry.image);
+    } catch (const Error& error) {
+      problem = error.what();
     }
     if (problem.empty()) {
       frame.encoding = recording_.encoding.empty() ? encodingOf(frame.image) : recording_.encoding;
       if (frame.encoding.empty()) {
-        problem = "has pixels of type " + cv::typeToString(frame.image.type()) +
+        problem = name + ": has pixels of type " + cv::typeToString(frame.image.type()) +
                   ", expected 8 or 16 bit with 1, 3 or 4 channels";
       } else if (!recording_.encoding.empty() &&
                  typeOf(recording_.encoding) != frame.image.type()) {
-        problem = "has pixels of type " + cv::typeToString(frame.image.type()) +
+        problem = name + ": has pixels of type " + cv::typeToString(frame.image.type()) +
                   ", which are not " + recording_.encoding;
       }
     }
     if (!problem.empty()) {
-      remarks_.push_back(InputError(entry.image.string(), "", problem).what());
+      remarks_.push_back(problem);
       return std::nullopt;
     }
     frame.stage_position_m = entry.stage_position_m;
@@ -345,9 +345,7 @@ void checkFiles(const Recording& recording, std::string_view source) {
 }  // namespace
 
 Recording parseRecording(std::string_view text, std::string_view source, const fs::path& folder) {
-  YAML::Node root;
-  try {
-    root = YAML::Load(std::string(text));
+  return readYaml(text, source, [&](const YAML::Node& root) {
     Recording recording = Reader(source, folder).read(root);
     if (!recording.encoding.empty() && !typeOf(recording.encoding)) {
       throw InputError(source, "encoding",
@@ -355,10 +353,7 @@ Recording parseRecording(std::string_view text, std::string_view source, const f
                            "\", expected mono8, mono16, bgr8 or bayer_{rggb,bggr,gbrg,grbg}{8,16}");
     }
     return recording;
-  } catch (const YAML::Exception& e) {
-    throw InputError(source, e.mark.is_null() ? "" : "line " + std::to_string(e.mark.line + 1),
-                     "is not valid YAML: " + e.msg);
-  }
+  });
 }
 
 Recording readRecording(const fs::path& path) {

@@ -6,6 +6,7 @@
 
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/yaml_text.h"
 
 namespace omnister::detail {
 namespace {
@@ -23,11 +24,11 @@ YamlView YamlView::load(std::string_view text, std::string_view source) {
   if (copy.rfind("%YAML:", 0) == 0) copy[0] = '#';
   YAML::Node root;
   try {
-    root = YAML::Load(copy);
+    root = yamlDocument(copy, source);
   } catch (const YAML::Exception& error) {
-    const std::string line =
-        error.mark.is_null() ? "" : "line " + std::to_string(error.mark.line + 1);
-    throw InputError(source, line, "is not YAML: " + error.msg);
+    throw yamlError(source, error);
+  } catch (const InputError&) {
+    throw;
   } catch (const std::exception& error) {
     throw InputError(source, "", std::string("is not YAML: ") + error.what());
   }

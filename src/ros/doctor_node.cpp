@@ -165,7 +165,8 @@ int run(int argc, char** argv) {
     printJson(facts, findings);
   else
     printText(facts, findings);
-  return std::cout ? 0 : 1;
+  if (!std::cout.flush()) throw Error("cannot write to standard output");
+  return 0;
 }
 
 }  // namespace

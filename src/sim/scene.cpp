@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "omnister/sim/scene.h"
 
-#include <yaml-cpp/yaml.h>
-
 #include <algorithm>
 #include <cmath>
 #include <map>
@@ -13,6 +11,7 @@
 #include "omnister/common/file_io.h"
 #include "omnister/common/image_file.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/yaml_text.h"
 #include "scene_data.h"
 
 namespace omnister::sim {
@@ -432,14 +431,9 @@ std::optional<double> Scene::rangeAlong(const Eigen::Vector3d& origin,
 
 ScenePtr parseScene(std::string_view text, std::string_view source,
                     const std::filesystem::path& folder) {
-  try {
-    const YAML::Node root = YAML::Load(std::string(text));
+  return readYaml(text, source, [&](const YAML::Node& root) {
     return std::make_shared<const Scene>(SceneReader(std::string(source), folder).read(root));
-  } catch (const YAML::Exception& error) {
-    throw InputError(source,
-                     error.mark.is_null() ? "" : "line " + std::to_string(error.mark.line + 1),
-                     "is not YAML: " + error.msg);
-  }
+  });
 }
 
 ScenePtr readScene(const std::filesystem::path& path) {

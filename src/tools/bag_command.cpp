@@ -84,7 +84,8 @@ class RunFolder {
  public:
   explicit RunFolder(const BagArguments& arguments)
       : arguments_(arguments), folder_(arguments.out) {
-    const Json run = describeRun(arguments);
+    // As it is read again: names need not be UTF-8.
+    const Json run = Json::parse(jsonText(describeRun(arguments)));
     const fs::path path = folder_ / "run.json";
     if (fs::exists(path) && !arguments.restart) {
       Json other;
@@ -104,7 +105,7 @@ class RunFolder {
     begun_ = fs::create_directories(folder_, error);
     if (error) throw IoError("make folder", folder_.string(), error.value());
     if (arguments.restart) clear();
-    writeFileAtomically(path, run.dump(2) + "\n");
+    writeFileAtomically(path, jsonText(run, 2) + "\n");
   }
 
   /// A run that is refused leaves no folder behind that it began.
@@ -143,7 +144,7 @@ class RunFolder {
                                         static_cast<double>(std::max<std::size_t>(1, pixels))},
                  {"median_relative_sigma", relative.empty() ? Json(nullptr) : Json(*half)},
                  {"seconds", result.seconds}};
-    writeFileAtomically(notePath(result.stamp_ns), note.dump() + "\n");
+    writeFileAtomically(notePath(result.stamp_ns), jsonText(note) + "\n");
   }
 
   // The notes of this run and those it went on from, as a table in the order of time.
@@ -155,12 +156,14 @@ class RunFolder {
     for (const fs::path& path : paths) {
       try {
         notes.push_back(Json::parse(readFile(path, 1u << 20)));
+        notes.back().at("stamp").get_ref<const std::string&>();
+        notes.back().at("valid_fraction").get<double>();
       } catch (const nlohmann::json::exception&) {
         throw InputError(path.string(), "", "is not the note of a cloud: --restart begins anew");
       }
     }
     const auto stamp = [](const Json& note) {
-      return parseNumber(note.value("stamp", "")).value_or(0.0);
+      return parseNumber(note.at("stamp").get_ref<const std::string&>()).value_or(0.0);
     };
     std::stable_sort(notes.begin(), notes.end(),
                      [&](const Json& a, const Json& b) { return stamp(a) < stamp(b); });
@@ -172,7 +175,7 @@ class RunFolder {
       for (const auto& [key, value] : note.items())
         row += (row.empty() ? "" : ",") + (value.is_string() ? value.get<std::string>()
                                            : value.is_null() ? std::string("nan")
-                                                             : value.dump());
+                                                             : jsonText(value));
       table += row + "\n";
     }
     writeFileAtomically(folder_ / "clouds.csv", table);
@@ -222,7 +225,7 @@ void runBagCommand(BagArguments& arguments, bool json) {
   }
   const std::vector<Json> notes = folder.writeTable();
   std::vector<double> valid;
-  for (const Json& note : notes) valid.push_back(note.value("valid_fraction", 0.0));
+  for (const Json& note : notes) valid.push_back(note.at("valid_fraction").get<double>());
   std::sort(valid.begin(), valid.end());
   const double seconds =
       std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "command_line.h"
 
+#include <fcntl.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -16,6 +17,7 @@
 
 #include "commands.h"
 #include "omnister/common/error.h"
+#include "omnister/common/image_file.h"
 #include "omnister/common/numbers.h"
 
 namespace omnister::tools {
@@ -52,10 +54,14 @@ constexpr AddCommand kCommands[] = {
 };
 
 std::string describe(const nlohmann::ordered_json& value) {
-  return value.is_string() ? value.get<std::string>() : value.dump();
+  return value.is_string() ? value.get<std::string>() : jsonText(value);
 }
 
 }  // namespace
+
+std::string jsonText(const nlohmann::ordered_json& value, int indent) {
+  return value.dump(indent, ' ', false, nlohmann::ordered_json::error_handler_t::replace);
+}
 
 bool& addJsonFlag(CLI::App& command) {
   static std::deque<bool> flags;
@@ -67,11 +73,33 @@ bool& addJsonFlag(CLI::App& command) {
 
 namespace {
 
+/// Where messages and progress go: standard error as it was at the beginning, also while image
+/// libraries must not write there.
+class Console {
+ public:
+  void open() {
+    close();
+    descriptor_ = ::fcntl(STDERR_FILENO, F_DUPFD_CLOEXEC, STDERR_FILENO + 1);
+  }
+  void close() {
+    if (descriptor_ >= 0) ::close(descriptor_);
+    descriptor_ = -1;
+  }
+  void write(const std::string& text) const {
+    ::dprintf(descriptor_ < 0 ? STDERR_FILENO : descriptor_, "%s", text.c_str());
+  }
+
+ private:
+  int descriptor_ = -1;
+};
+
+Console console;
+
 /// Whether a terminal's last line shows progress that other text must not run into.
 bool progress_line_open = false;
 
 void closeProgressLine() {
-  if (progress_line_open) std::fputs("\r\033[K", stderr);
+  if (progress_line_open) console.write("\r\033[K");
   progress_line_open = false;
 }
 
@@ -80,7 +108,7 @@ void closeProgressLine() {
 void printResult(bool json, const nlohmann::ordered_json& result) {
   closeProgressLine();
   if (json) {
-    std::cout << result.dump() << '\n';
+    std::cout << jsonText(result) << '\n';
   } else {
     for (const auto& [key, value] : result.items()) {
       std::cout << key << ": " << describe(value) << '\n';
@@ -92,7 +120,7 @@ void printResult(bool json, const nlohmann::ordered_json& result) {
 
 void say(const std::string& message) {
   closeProgressLine();
-  std::cerr << message << '\n';
+  console.write(message + '\n');
 }
 
 Progress consoleProgress() {
@@ -118,8 +146,7 @@ Progress consoleProgress() {
     const double left = fraction > 0.0 ? elapsed * (1.0 - fraction) / fraction : 0.0;
     std::string line = stage + ": " + std::to_string(std::lround(100.0 * fraction)) + " %";
     if (fraction > 0.0) line += ", " + std::to_string(std::lround(left)) + " s left";
-    std::fprintf(stderr, terminal ? "\r\033[K%s" : "%s\n", line.c_str());
-    std::fflush(stderr);
+    console.write(terminal ? "\r\033[K" + line : line + '\n');
     progress_line_open = terminal;
   };
 }
@@ -178,6 +205,8 @@ bool lexical_cast(const std::string& text, Size& size) {
 int runCommandLine(int argc, const char* const* argv) {
   // Our messages say what is wrong with a file; a library's chatter would come before them.
   cv::utils::logging::setLogLevel(cv::utils::logging::LOG_LEVEL_SILENT);
+  silenceDecoders();
+  console.open();
   CLI::App app("OMNister: wide-angle stereo from distorted images", "omnister");
   app.set_version_flag("--version", OMNISTER_VERSION);
   app.require_subcommand(1);

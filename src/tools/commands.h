@@ -20,11 +20,15 @@ bool& addJsonFlag(CLI::App& command);
 /// value" line each.
 void printResult(bool json, const nlohmann::ordered_json& result);
 
+/// A JSON text, also where a string is no UTF-8, as names of files and frames need not be: what is
+/// not stands there as U+FFFD.
+std::string jsonText(const nlohmann::ordered_json& value, int indent = -1);
+
 /// A remark for a person, on standard error.
 void say(const std::string& message);
 
-/// Progress on standard error with percentage and time left: rewrites one line on a terminal, else a
-/// line every two seconds, and none for what is over sooner.
+/// Progress on standard error with percentage and time left: rewrites one line on a terminal, else
+/// a line every two seconds, and none for what is over sooner.
 Progress consoleProgress();
 
 /// To be called before any work: no output may be an input or another output (links followed), a

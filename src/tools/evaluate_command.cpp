@@ -44,7 +44,7 @@ void addThesis(CLI::App& evaluate) {
     if (error) throw IoError("create", arguments->out, error.value());
     const ThesisEvaluation evaluation = evaluateThesis(arguments->options);
     const std::filesystem::path folder(arguments->out);
-    writeFileAtomically(folder / "thesis.json", evaluation.json.dump(2) + "\n");
+    writeFileAtomically(folder / "thesis.json", jsonText(evaluation.json, 2) + "\n");
     writeFileAtomically(folder / "index.html", evaluation.html);
     if (json) {
       printResult(true, evaluation.json);

@@ -3,6 +3,7 @@
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
+#include <sys/stat.h>
 
 #include <fstream>
 #include <opencv2/imgcodecs.hpp>
@@ -175,6 +176,20 @@ TEST_F(ReplayCameraTest, ABrokenImageIsALostFrameAndARemark) {
   EXPECT_TRUE(camera->takeRemarks().empty());
 }
 
+TEST_F(ReplayCameraTest, WhatBecameOfAnImageSinceIsALostFrameAndARemark) {
+  for (const char* name : {"1.png", "2.png", "3.png", "4.png"}) writeImage(name, name[0] - '0');
+  const auto camera = open(unpaced());
+  // A picture of 100 GB that is all header, a pipe that nobody writes to, and nothing.
+  std::ofstream(folder_.path() / "1.png") << "P5\n316000 316000\n255\n";
+  for (const char* name : {"2.png", "3.png"}) std::filesystem::remove(folder_.path() / name);
+  ASSERT_EQ(::mkfifo((folder_.path() / "2.png").c_str(), 0600), 0);
+  EXPECT_THAT(values(camera.get()), testing::ElementsAre(4));
+  EXPECT_THAT(camera->takeRemarks(),
+              testing::ElementsAre(HasSubstr("1.png: is 316000x316000 pixels"),
+                                   HasSubstr("2.png: is not a regular file"),
+                                   HasSubstr("3.png: No such file")));
+}
+
 TEST_F(ReplayCameraTest, OnlyBrokenImagesInALoopStillReturn) {
   std::ofstream(folder_.path() / "1.png") << "no picture";
   CameraSettings settings = unpaced();
@@ -235,6 +250,10 @@ TEST_F(ReplayCameraTest, RefusesBrokenListsWithOneClearLine) {
       {"version: 1\nencoding: purple\nframes: [{image: a.png}]", "encoding"},
       {"version: 1\nfps: 3\nframes: [{image: a.png}]", "fps"},
       {"version: 1\nframes: [{image: a.png", "YAML"},
+      {"version: 1\nrate: 2\nframes: [{image: a.png}]\nrate: 3", "rate: stands there twice"},
+      {"version: 1\nframes: [{image: a.png, stamp: 1, stamp: 2}]",
+       "frames[0].stamp: stands there twice"},
+      {"version: 1\nframes: [{image: a.png}]\n---\nversion: 1", "line 4: begins another"},
   };
   for (const auto& [text, expected] : cases) {
     writeList(text);

@@ -74,8 +74,15 @@ TEST_F(Bag, MakesACloudOfEverySetAndGoesOnWhereItWasKilled) {
 }
 
 TEST_F(Bag, RefusesToMixRunsWithOtherSettings) {
-  const std::string bag = recorded();
+  // No UTF-8, which JSON would have.
+  fs::rename(recorded(), path("r\xFCn.bag"));
+  const std::string bag = path("r\xFCn.bag");
   figures({"bag", bag, "--out", path("out"), "--max-range", "20", "--json"});
+  const std::string note = path("out/cloud_1001.000000000.json");
+  writeFileAtomically(note, "[1]");
+  const test::Outcome broken = run({"bag", bag, "--out", path("out"), "--max-range", "20"});
+  EXPECT_EQ(broken.code, 1);
+  EXPECT_THAT(broken.err, AllOf(HasSubstr(note + ": is not the note"), HasSubstr("--restart")));
   const test::Outcome other = run({"bag", bag, "--out", path("out"), "--max-range", "10"});
   EXPECT_EQ(other.code, 1);
   EXPECT_THAT(other.err,

@@ -22,6 +22,11 @@ enum class ImageColor { kGray, kColor, kAsIs };
 cv::Mat readImage(const std::filesystem::path& path, ImageColor color = ImageColor::kAsIs,
                   std::size_t max_pixels = 100'000'000);
 
+/// From now on nothing gets to standard error while readImage() decodes: image libraries print
+/// there what its error says too. For a program whose standard error is for a person alone; what
+/// other threads write there meanwhile is lost.
+void silenceDecoders();
+
 /// Writes by the extension: PNG, JPEG, TIFF, BMP, PGM or PPM. Atomic.
 /// @throws IoError; InputError for another extension or a depth that the format cannot hold
 void writeImage(const std::filesystem::path& path, const cv::Mat& image);

@@ -192,6 +192,9 @@ TEST(RigFile, RefusesNamingTheKey) {
   EXPECT_THAT(refusal(with("0, 1]", "0, 0]")), HasSubstr("T_ref_disp"));
   EXPECT_THAT(refusal(with("baseline_m: 0.1", "baseline_m: 0.2")), HasSubstr("rig.baseline_m"));
   EXPECT_THAT(refusal(good + "  speed: 3\n"), HasSubstr("rig.speed"));
+  EXPECT_THAT(refusal(good + "  version: 1\n"), HasSubstr("rig.version: stands there twice"));
+  EXPECT_THAT(refusal(good + "---\n" + good), HasSubstr("begins another YAML document"));
+  EXPECT_EQ(refusal(good + "---\n"), "accepted");
 }
 
 }  // namespace

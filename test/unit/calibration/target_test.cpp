@@ -59,6 +59,8 @@ TEST(Target, RefusalsNameSourceKeyValueAndExpectation) {
       {"", "expected a target such as"},
       {"[1, 2]", "expected a target such as"},
       {"{type: checkerboard, cols: 8", "is not YAML"},
+      {"{type: checkerboard, cols: 8, rows: 6, square_m: 1}\n---\n# another\n{rows: 7}",
+       "line 4: begins another"},
       {"{cols: 8, rows: 6, square_m: 1}", "type: is missing"},
       {"{type: chessboard, cols: 8, rows: 6, square_m: 1}", "'chessboard', expected checkerboard,"},
       {"{type: checkerboard, rows: 6, square_m: 1}", "cols: is missing"},
@@ -102,7 +104,7 @@ TEST(Target, RefusalsNameSourceKeyValueAndExpectation) {
     EXPECT_THAT(refusal(text), HasSubstr("board.yaml")) << text;
     ++refused;
   }
-  EXPECT_EQ(refused, 31);
+  EXPECT_EQ(refused, 32);
 }
 
 TEST(Target, PointsRunRowByRowFromTheOrigin) {

@@ -263,6 +263,7 @@ TEST(LensFile, RefusesWithFileKeyAndExpectation) {
       {"just a word", {"not a YAML mapping"}},
       {"[1, 2, 3]", {"not a YAML mapping"}},
       {"a: [1, 2", {"not YAML"}},
+      {good + "---\n" + good, {"line ", "begins another YAML document"}},
       {"\x01\x02\x7f", {"wide.yaml"}},
       {std::string("\0\0\0\0", 4), {"wide.yaml"}},
       {"\xff\xfe\xfd", {"wide.yaml"}},

@@ -100,6 +100,7 @@ TEST(Scene, RefusalsNameKeyValueAndExpectation) {
       {"", {"test.yaml", "expected a mapping"}},
       {"[1, 2]", {"a sequence", "expected a mapping"}},
       {"version: 1\nobjects: {", {"line", "is not YAML"}},
+      {"version: 1\nobjects: []\n...\nversion: 1", {"line 4", "begins another YAML document"}},
       {"objects: []", {"version", "is missing"}},
       {"version: 2\nobjects: []", {"version", "is 2, expected 1"}},
       {"version: 1\nobjects: []\nfog: 1",

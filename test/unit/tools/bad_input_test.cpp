@@ -240,6 +240,7 @@ std::map<std::string, std::string> nonsense() {
           {"a tag", "!!python/object:os.system [ls]\n"},
           {"many documents", repeated("---\na: 1\n", 1000)},
           {"a list", "[1, 2, 3]\n"},
+          {"a comma", ","},
           {"a number", "1e999\n"},
           {"null", "~\n"},
           {"tabs", "a:\n\t- b\n"},
@@ -359,6 +360,23 @@ TEST_F(BadInput, NonsenseInThePlaceOfEveryNumberInAFile) {
     }
     put(kind, good);
   }
+}
+
+TEST_F(BadInput, ADamagedImageIsOneLine) {
+  std::string damaged = readFile("image.png");
+  damaged[damaged.size() / 2] ^= 0x55;
+  // Libraries that decode have much to say about these.
+  for (const std::string& image :
+       {damaged, std::string("P2 64 48 255\n-1"), std::string("P5 64 48 99999\n")}) {
+    put("image.png", image);
+    const test::Outcome outcome =
+        test::run({"dewarp", "--lens", "lens.yaml", "--size", "20x10", "image.png", "out.png"});
+    EXPECT_EQ(outcome.code, 1);
+    EXPECT_THAT(outcome.err, StartsWith("omnister: image.png: cannot be decoded"));
+    EXPECT_EQ(std::count(outcome.err.begin(), outcome.err.end(), '\n'), 1) << outcome.err;
+  }
+  // And standard error is what it was.
+  EXPECT_NE(test::run({"dewarp", "--lens", "no.yaml", "image.png", "out.png"}).err, "");
 }
 
 TEST_F(BadInput, ImagesThatAreOthersThanTheLens) {
