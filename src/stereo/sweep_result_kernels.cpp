@@ -200,7 +200,8 @@ HWY_INLINE void StoreFront(D d, hn::Vec<D> v, float* to, int count) {
   } else {
     HWY_ALIGN float last[HWY_MAX_BYTES / sizeof(float)];
     hn::Store(v, d, last);
-    std::copy(last, last + count, to);
+    // Not std::copy: to GCC, that looks like one of less than nothing where a vector has one lane.
+    for (int i = 0; i < count; ++i) to[i] = last[i];
   }
 }
 

@@ -13,6 +13,7 @@
 
 #include "child_process.h"
 #include "device/own_network.h"
+#include "full_tests.h"
 #include "omnister/sim/gige_server.h"
 
 namespace omnister::device {
@@ -557,9 +558,7 @@ TEST_F(ForeignCamera, StreamsEveryFormat) {
 }
 
 TEST_F(ForeignCamera, AKilledCameraIsLostAndComesBack) {
-  const char* full = std::getenv("OMNISTER_FULL_TESTS");
-  if (!full || std::string(full) != "ON")
-    GTEST_SKIP() << "takes long: run with OMNISTER_FULL_TESTS=ON";
+  if (!test::fullTests()) GTEST_SKIP() << "runs with ./run test --full";
   std::unique_ptr<Camera> camera = openPatiently();
   settings_.identity = camera->identity();
   camera->start();

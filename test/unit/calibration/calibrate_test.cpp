@@ -3,9 +3,9 @@
 
 #include <gmock/gmock.h>
 
-#include <cstdlib>
 #include <filesystem>
 
+#include "full_tests.h"
 #include "omnister/calibration/uncertainty.h"
 #include "omnister/common/error.h"
 #include "synthetic_boards.h"
@@ -14,16 +14,12 @@ namespace omnister {
 namespace {
 
 using test::BoardScene;
+using test::fullTests;
 using test::wideLens;
 using test::wideScene;
 using ::testing::HasSubstr;
 
 constexpr double kDegree = M_PI / 180.0;
-
-bool fullTests() {
-  const char* full = std::getenv("OMNISTER_FULL_TESTS");
-  return full != nullptr && std::string(full) == "ON";
-}
 
 LensStructure sameStructure(const LensModel& lens) { return structureOf(lens); }
 

@@ -10,6 +10,7 @@
 #include <opencv2/imgcodecs.hpp>
 #include <opencv2/imgproc.hpp>
 
+#include "full_tests.h"
 #include "omnister/calibration/detections.h"
 #include "omnister/common/error.h"
 #include "omnister/common/image_file.h"
@@ -100,9 +101,7 @@ TEST(DetectorOnRealImages, FindsEveryBoardOfTheOtherCamera) {
   const Target target{TargetType::kCheckerboard, 8, 6, 0.0244};
   const auto right = imagesIn(kData / "opencv_jy_stereo" / "right");
   if (right.empty()) GTEST_SKIP() << "no " << kData / "opencv_jy_stereo";
-  const char* full = std::getenv("OMNISTER_FULL_TESTS");
-  if (full == nullptr || std::string(full) != "ON")
-    GTEST_SKIP() << "only with OMNISTER_FULL_TESTS=ON";
+  if (!test::fullTests()) GTEST_SKIP() << "runs with ./run test --full";
   std::vector<std::string> missed;
   EXPECT_EQ(detectInFiles(right, target, {}, &missed).views.size(), right.size());
   EXPECT_THAT(missed, ::testing::IsEmpty());

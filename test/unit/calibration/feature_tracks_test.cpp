@@ -5,11 +5,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <filesystem>
 #include <set>
 #include <string>
 
+#include "full_tests.h"
 #include "omnister/calibration/target_free.h"
 #include "omnister/common/error.h"
 #include "rendered_scans.h"
@@ -111,8 +111,7 @@ TEST(FeatureTracks, LensFromARenderedRoom) {
 }
 
 TEST(FeatureTracks, LensFromARenderedRoomInFull) {
-  const char* full = std::getenv("OMNISTER_FULL_TESTS");
-  if (full == nullptr || std::string(full) != "ON") GTEST_SKIP() << "runs with ./run test --full";
+  if (!test::fullTests()) GTEST_SKIP() << "runs with ./run test --full";
   const cv::Size size(1280, 960);
   const RenderedScans rendered = renderScans(size, 300.0, 9, 3);
   TrackingOptions tracking;
@@ -136,8 +135,7 @@ TEST(FeatureTracks, LensFromARenderedRoomInFull) {
 
 // A car that turns by half a degree on its way is no stage: what comes of it, up to the one scale.
 TEST(FeatureTracks, LensFromACarThatSlidesSideways) {
-  const char* full = std::getenv("OMNISTER_FULL_TESTS");
-  if (full == nullptr || std::string(full) != "ON") GTEST_SKIP() << "runs with ./run test --full";
+  if (!test::fullTests()) GTEST_SKIP() << "runs with ./run test --full";
   if (!std::filesystem::exists(test::dataFolder("planesweep_car_fisheye"))) {
     GTEST_SKIP() << "planesweep_car_fisheye is not there";
   }

@@ -10,6 +10,7 @@
 #include <iostream>
 #include <opencv2/imgproc.hpp>
 
+#include "full_tests.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/stereo/cloud.h"
 #include "omnister/stereo/matcher.h"
@@ -152,7 +153,7 @@ TEST(BoardRig, RangeOnTheBoardIsThatOfItsPlane) {
   options.min_range = 0.15;
   options.max_range = 5.0;
   const auto matcher = makeMatcher("sweep", geometry, options);
-  const bool full = std::getenv("OMNISTER_FULL_TESTS") != nullptr;
+  const bool full = test::fullTests();
   std::vector<double> medians, coverages;
   for (std::size_t i = 0; i < rig.left_corners.size(); i += full ? 1 : 7) {
     cv::Mat points(1, static_cast<int>(rig.left_corners[i].size()), CV_32FC3);

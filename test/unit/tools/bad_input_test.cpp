@@ -6,7 +6,6 @@
 #include <gmock/gmock.h>
 #include <sys/stat.h>
 
-#include <cstdlib>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
@@ -17,6 +16,7 @@
 #include <streambuf>
 
 #include "command_run.h"
+#include "full_tests.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/pose.h"
 #include "omnister/lens/lens_file.h"
@@ -347,8 +347,7 @@ TEST_F(BadInput, NonsenseInThePlaceOfEveryNumberInAFile) {
       while (at < good.size() && numeric(good[at])) ++at;
       if (at > start) places.emplace_back(start, at - start);
     }
-    const char* full = std::getenv("OMNISTER_FULL_TESTS");
-    const std::size_t most = full != nullptr && std::string(full) == "ON" ? 25 : 4;
+    const std::size_t most = test::fullTests() ? 25 : 4;
     const std::size_t step = 1 + places.size() / most;
     for (std::size_t i = 0; i < places.size(); i += step) {
       for (const char* number : kNumbers) {
