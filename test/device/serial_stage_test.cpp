@@ -11,6 +11,7 @@
 #include <thread>
 
 #include "device/serial_port.h"
+#include "full_tests.h"
 #include "omnister/device/camera.h"
 #include "omnister/sim/serial_devices.h"
 #include "temporary_folder.h"
@@ -488,10 +489,7 @@ TEST_F(GrblStageTest, SaysWhatAnsweredInsteadOfAStage) {
 // Whatever goes wrong on the wire or with the stage: a position that is called referenced and free
 // of faults is where the carriage truly was while it was read.
 
-int movesToMake() {
-  const char* full = getenv("OMNISTER_FULL_TESTS");
-  return full != nullptr && std::string(full) == "ON" ? 1000 : 12;
-}
+int movesToMake() { return test::fullTests() ? 1000 : 12; }
 
 struct Tally {
   int arrived = 0, refused = 0, lost = 0, faults = 0, homings = 0, checked = 0;
