@@ -71,6 +71,8 @@ cv::Mat convert(const sensor_msgs::Image& image, int bits, const std::string& wa
 }  // namespace
 
 std::uint32_t MissingMessages::before(const std_msgs::Header& header) {
+  if (header.stamp < stamp_) return 0;
+  stamp_ = header.stamp;
   const std::uint32_t last = std::exchange(last_, header.seq);
   return last != 0 && header.seq > last ? header.seq - last - 1 : 0;
 }

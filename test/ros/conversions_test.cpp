@@ -45,6 +45,25 @@ TEST(ImageMessages, BigEndianSamplesAreReadAsTheyWereMeant) {
   EXPECT_LE(cv::norm(toMat8(image, false), expected, cv::NORM_INF), 1.0);
 }
 
+TEST(MissingMessages, AreCountedByNumbersOfMessagesThatFollowEachOther) {
+  MissingMessages missing;
+  const auto before = [&](std::uint32_t number, double stamp) {
+    std_msgs::Header header;
+    header.seq = number;
+    header.stamp = ros::Time(stamp);
+    return missing.before(header);
+  };
+  EXPECT_EQ(before(20, 1.0), 0U);
+  EXPECT_EQ(before(21, 1.1), 0U);
+  EXPECT_EQ(before(24, 1.4), 2U);
+  EXPECT_EQ(before(9, 0.9), 0U);  // late, and numbered for others
+  EXPECT_EQ(before(25, 1.5), 0U);
+  EXPECT_EQ(before(1, 1.6), 0U);  // the publisher began anew
+  EXPECT_EQ(before(3, 1.8), 1U);
+  missing.reset();
+  EXPECT_EQ(before(50, 0.1), 0U);
+}
+
 TEST(Stamps, SurviveTheRoundTripAndStayInRange) {
   const device::Stamp stamp(std::chrono::nanoseconds(1342626147554042001LL));
   EXPECT_EQ(fromRosTime(toRosTime(stamp)), stamp);

@@ -33,12 +33,14 @@ cv::Mat toBgr(const sensor_msgs::Image& image, int bits);
 class MissingMessages {
  public:
   /// @return how many are missing between the message before and this one; 0 for the first, for
-  /// numbers that begin anew and for publishers that give none
+  /// numbers that begin anew, for publishers that give none, and for an older message: roscpp may
+  /// deliver one from before the subscription late, with another number
   std::uint32_t before(const std_msgs::Header& header);
-  void reset() { last_ = 0; }
+  void reset() { *this = MissingMessages(); }
 
  private:
   std::uint32_t last_ = 0;
+  ros::Time stamp_;
 };
 
 }  // namespace omnister
