@@ -187,6 +187,8 @@ TEST(StereoNodelet, ComesAndGoesAHundredTimes) {
   comeAndGo<sensor_msgs::PointCloud2>("/busy/stereo", "omnister/StereoNodelet", "points2");
   parameters.setParam("matcher", "magic");
   EXPECT_FALSE(nodelet::Loader(false).load("/busy/stereo", "omnister/StereoNodelet", {}, {}));
+  // Else it would not load when the test is run again with the same master.
+  parameters.deleteParam("matcher");
 }
 
 TEST(CalibrationNodelet, ComesAndGoesAHundredTimes) {
@@ -204,8 +206,10 @@ TEST(ViewNodelet, ComesAndGoesAHundredTimes) {
   comeAndGo<sensor_msgs::Image>("/busy/view_node", "omnister/ViewNodelet", "view/image_raw");
   comeAndGo<sensor_msgs::Image>("/busy/view_node", "omnister/ViewNodelet", "view/depth/image_raw",
                                 20);
-  ros::NodeHandle("/busy/view_node").setParam("hfov", -1.0);
+  ros::NodeHandle parameters("/busy/view_node");
+  parameters.setParam("hfov", -1.0);
   EXPECT_FALSE(nodelet::Loader(false).load("/busy/view_node", "omnister/ViewNodelet", {}, {}));
+  parameters.deleteParam("hfov");
 }
 
 TEST(NodeletManager, GetsItsNodeletsBackAfterItWasKilled) {
