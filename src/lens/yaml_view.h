@@ -39,8 +39,8 @@ class YamlView {
   const std::string& source() const { return source_; }
 
  private:
-  YamlView(YAML::Node node, std::string source, std::string path)
-      : node_(std::move(node)), source_(std::move(source)), path_(std::move(path)) {}
+  YamlView(const YAML::Node& node, std::string source, std::string path)
+      : node_(node), source_(std::move(source)), path_(std::move(path)) {}
   std::string scalar(const char* expected) const;
 
   YAML::Node node_;

@@ -11,7 +11,6 @@
 #include <sensor_msgs/PointCloud2.h>
 #include <sys/socket.h>
 #include <tf2_ros/buffer.h>
-#include <tf2_ros/transform_listener.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -30,6 +29,7 @@
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/messages.h"
 #include "omnister/ros/stereo_messages.h"
+#include "omnister/ros/transform_input.h"
 
 namespace omnister {
 namespace {
@@ -256,9 +256,9 @@ void judgeDriver(const std::map<std::string, Ears::Status>& statuses, DoctorFact
         std::any_of(images.publishers.begin(), images.publishers.end(),
                     [&](const std::string& publisher) { return withoutSlash(publisher) == node; });
     if (!publishes && node.compare(0, folder.size(), folder) != 0) continue;
-    const auto value = [&](const std::string& key) {
-      const auto found = status.values.find(key);
-      return found == status.values.end() ? std::string() : found->second;
+    const auto value = [&values = status.values](const std::string& key) {
+      const auto found = values.find(key);
+      return found == values.end() ? std::string() : found->second;
     };
     images.driver = true;
     images.driver_node = "/" + node;
@@ -362,7 +362,7 @@ DoctorFacts gatherFacts(const DoctorOptions& options) {
   Ears ears(stereo.rig ? 2 : 1);
   std::vector<ros::Subscriber> subscribers;
   tf2_ros::Buffer tf;
-  const tf2_ros::TransformListener listener(tf);
+  const TransformInput listener(tf);
   subscribers.push_back(node.subscribe("/diagnostics", 100, &Ears::onDiagnostics, &ears));
   const std::vector<std::string> stages = graph.published("omnister/StageState");
   if (!stages.empty()) {

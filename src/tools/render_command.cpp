@@ -37,6 +37,7 @@ void run(const Arguments& arguments, bool json) {
   if (!arguments.range.empty()) stageRange(arguments.range, rendering.range)->commit();
   image_file->commit();
 
+  // NOLINTNEXTLINE(misc-redundant-expression): what is NaN is not equal.
   const cv::Mat hit = rendering.range == rendering.range;
   double nearest = 0.0;
   double furthest = 0.0;

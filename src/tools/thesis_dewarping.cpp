@@ -96,6 +96,7 @@ Forward forwardMap(const LensModel& lens, const cv::Mat& image, double limit) {
   const double reach = R0 * std::tan(limit);
   const int side = 2 * static_cast<int>(reach) + 1;
   // The image shows less than a square of that reach.
+  const int half = side / 2;
   cv::Mat1b picture(side, side, uchar{0});
   cv::Mat1b hit(side, side, uchar{0});
   int top = side, bottom = 0, left = side, right = 0;
@@ -103,8 +104,8 @@ Forward forwardMap(const LensModel& lens, const cv::Mat& image, double limit) {
     for (int u = 0; u < image.cols; ++u) {
       const auto uv = dewarp(lens, R0, Vector2d(u, v));
       if (!uv || uv->norm() > reach) continue;
-      const int x = static_cast<int>(std::lround(uv->x() + side / 2));
-      const int y = static_cast<int>(std::lround(uv->y() + side / 2));
+      const int x = static_cast<int>(std::lround(uv->x() + half));
+      const int y = static_cast<int>(std::lround(uv->y() + half));
       if (x < 0 || y < 0 || x >= side || y >= side) continue;
       picture(y, x) = image.at<uchar>(v, u);
       hit(y, x) = 1;
@@ -118,7 +119,7 @@ Forward forwardMap(const LensModel& lens, const cv::Mat& image, double limit) {
   std::size_t seen = 0, empty = 0, seen_rim = 0, empty_rim = 0;
   for (int y = top; y <= bottom; ++y) {
     for (int x = left; x <= right; ++x) {
-      const Vector3d ray(x - side / 2, y - side / 2, R0);
+      const Vector3d ray(x - half, y - half, R0);
       if (ray.head<2>().norm() > reach) continue;
       const auto pixel = lens.project(ray);
       if (!pixel || !inside(*pixel, image.size(), 1.0)) continue;
@@ -135,8 +136,8 @@ Forward forwardMap(const LensModel& lens, const cv::Mat& image, double limit) {
   result.gaps_rim = static_cast<double>(empty_rim) / std::max<std::size_t>(1, seen_rim);
   // A part towards the corner at full size shows the gaps.
   const int part = std::min({400, right - left + 1, bottom - top + 1});
-  const int x0 = std::clamp(side / 2 + static_cast<int>(0.62 * reach), left, right - part + 1);
-  const int y0 = std::clamp(side / 2 + static_cast<int>(0.3 * reach), top, bottom - part + 1);
+  const int x0 = std::clamp(half + static_cast<int>(0.62 * reach), left, right - part + 1);
+  const int y0 = std::clamp(half + static_cast<int>(0.3 * reach), top, bottom - part + 1);
   result.picture = picture(cv::Rect(x0, y0, part, part)).clone();
   return result;
 }
