@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <console_bridge/console.h>
+
 #include <algorithm>
 #include <chrono>
 #include <cmath>
@@ -202,6 +204,8 @@ class RunFolder {
 };
 
 void runBagCommand(BagArguments& arguments, bool json) {
+  // What it says of a damaged bag comes before our message, which says the same.
+  console_bridge::noOutputHandler();
   const auto start = std::chrono::steady_clock::now();
   arguments.options.rig = arguments.mode == "rig";
   arguments.options.pairing.history =
