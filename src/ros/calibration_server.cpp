@@ -15,9 +15,17 @@
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/lens/lens_store.h"
+#include "omnister/ros/action_status.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/image_input.h"
+
+template <>
+void actionlib::ActionServer<omnister::CalibrateAction>::publishStatus() {
+  const boost::recursive_mutex::scoped_lock lock(lock_);
+  status_pub_.publish(
+      omnister::detail::actionStatus(status_list_, last_cancel_, status_list_timeout_));
+}
 
 namespace omnister {
 namespace {

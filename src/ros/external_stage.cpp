@@ -65,7 +65,7 @@ ExternalStageSource::ExternalStageSource(const ros::NodeHandle& node,
       throw InputError("stage", "external_child_frame_id", "is empty, expected a tf frame");
     }
     buffer_ = std::make_unique<tf2_ros::Buffer>();
-    listener_ = std::make_unique<tf2_ros::TransformListener>(*buffer_);
+    listener_ = std::make_unique<TransformInput>(*buffer_);
   }
 }
 

@@ -14,9 +14,17 @@
 #include "omnister/common/image_motion.h"
 #include "omnister/common/numbers.h"
 #include "omnister/lens/lens_store.h"
+#include "omnister/ros/action_status.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/image_input.h"
 #include "omnister/ros/parameters.h"
+
+template <>
+void actionlib::ActionServer<omnister::ScanAction>::publishStatus() {
+  const boost::recursive_mutex::scoped_lock lock(lock_);
+  status_pub_.publish(
+      omnister::detail::actionStatus(status_list_, last_cancel_, status_list_timeout_));
+}
 
 namespace omnister {
 namespace {
@@ -116,6 +124,7 @@ void ScanServer::onState(const StageState::ConstPtr& state) {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     const ros::Time stamp = state->header.stamp;
+    if (!canReckonWith(stamp)) return;
     if (!readings_.empty() && stamp < readings_.back().header.stamp) readings_.clear();
     if (!readings_.empty() && stamp == readings_.back().header.stamp) {
       readings_.back() = *state;

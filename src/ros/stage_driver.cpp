@@ -7,8 +7,16 @@
 #include <cmath>
 
 #include "omnister/common/numbers.h"
+#include "omnister/ros/action_status.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/parameters.h"
+
+template <>
+void actionlib::ActionServer<omnister::MoveStageAction>::publishStatus() {
+  const boost::recursive_mutex::scoped_lock lock(lock_);
+  status_pub_.publish(
+      omnister::detail::actionStatus(status_list_, last_cancel_, status_list_timeout_));
+}
 
 namespace omnister {
 namespace {

@@ -102,7 +102,7 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
       eyes_[i].lens_from_file = true;
     }
   }
-  tf_listener_ = std::make_unique<tf2_ros::TransformListener>(tf_buffer_);
+  tf_listener_ = std::make_unique<TransformInput>(tf_buffer_);
   // Reads the same parameters, which are known to be good by now.
   config_server_ = std::make_unique<dynamic_reconfigure::Server<StereoConfig>>(
       config_mutex_, callbacks_.on(private_node));
@@ -288,13 +288,13 @@ void StereoPipeline::subscribe() {
         transport_, "right/image_raw", 4, hints);
     SyncPolicy policy(8);
     left_subscriber_->registerCallback(
-        [this](const sensor_msgs::ImageConstPtr& image) { count(*image, 0); });
+        [this](const sensor_msgs::ImageConstPtr& image) { pair(image, 0); });
     right_subscriber_->registerCallback(
-        [this](const sensor_msgs::ImageConstPtr& image) { count(*image, 1); });
+        [this](const sensor_msgs::ImageConstPtr& image) { pair(image, 1); });
     policy.setMaxIntervalDuration(ros::Duration(parameters_.max_skew));
     policy.setReset(true);
     synchronizer_ = std::make_unique<message_filters::Synchronizer<SyncPolicy>>(
-        static_cast<const SyncPolicy&>(policy), *left_subscriber_, *right_subscriber_);
+        static_cast<const SyncPolicy&>(policy), to_synchronizer_[0], to_synchronizer_[1]);
     synchronizer_->registerCallback(boost::bind(&StereoPipeline::onImages, this,
                                                 boost::placeholders::_1, boost::placeholders::_2));
   } else {
@@ -315,6 +315,17 @@ void StereoPipeline::unsubscribe() {
   pairing_.reset("nobody listens");
   if (pending_) ++drops_["nobody listens"];
   pending_.reset();
+}
+
+void StereoPipeline::pair(const sensor_msgs::ImageConstPtr& image, std::size_t eye) {
+  count(*image, eye);
+  const ros::Time now = ros::Time::now(), stamp = image->header.stamp;
+  // The synchronizer takes differences of stamps and a tenth more, which ROS must be able to hold.
+  constexpr double kFarthest = 9e8;  // [s]
+  const bool near = now.isZero() || std::abs(stamp.toSec() - now.toSec()) < kFarthest;
+  if (!near || !canReckonWith(stamp))
+    return drop("bad image", eyes_[eye].topic + ": the stamp is decades off", true);
+  to_synchronizer_[eye].add(image);
 }
 
 void StereoPipeline::count(const sensor_msgs::Image& image, std::size_t eye) {

@@ -17,9 +17,13 @@ import roslib.packages
 import rosgraph
 import rospy
 import rostest
+from actionlib_msgs.msg import GoalID, GoalStatusArray
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
+from tf2_msgs.msg import TFMessage
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -254,6 +258,30 @@ class EveryNode(unittest.TestCase):
         self.assertGreater((self.work / 'cloud.ply').stat().st_size, 10000)
         self.assertGreater((self.work / 'range.tiff').stat().st_size, 10000)
         self.rig.call('/stage/halt', Trigger)
+
+    def test_4_stamps_that_ros_cannot_reckon_with_end_nothing(self):
+        end = Header(stamp=rospy.Time(4294967295, 999999999), frame_id='stage_base')
+        cancels = ['/stage/move_stage/cancel', '/camera/calibrate/cancel', '/camera/scan/cancel']
+        hostile = [(topic, GoalID(stamp=end.stamp, id='never')) for topic in cancels]
+        transform = TransformStamped(header=end, child_frame_id='nowhere')
+        transform.transform.rotation.w = 1.0
+        hostile.append(('/tf', TFMessage([transform])))
+        hostile.append(('/stage/stage_state', self.rig.msg.StageState(header=end)))
+        publishers = []
+        for topic, message in hostile:
+            publisher = rospy.Publisher(topic, type(message), queue_size=1)
+            heard = Graph().heard[topic]
+            self.assertTrue(eventually(lambda: publisher.get_num_connections() >= len(heard)), topic)
+            publisher.publish(message)
+            if topic in cancels:
+                with self.listener(topic[:-len('cancel')] + 'status', GoalStatusArray) as came:
+                    self.assertTrue(eventually(lambda: len(came) > 3), topic)
+            publishers.append(publisher)
+        self.a_cloud()
+        for kind, program in self.programs.items():
+            self.assertIsNone(program.process.poll(), kind)
+        for publisher in publishers:
+            publisher.unregister()
 
     def test_5_a_wrong_parameter_is_refused_by_name(self):
         refused = 0

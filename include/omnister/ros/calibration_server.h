@@ -27,6 +27,12 @@
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/view_collector.h"
 
+namespace actionlib {
+/// See action_status.h.
+template <>
+void ActionServer<omnister::CalibrateAction>::publishStatus();
+}  // namespace actionlib
+
 namespace omnister {
 
 /// Private parameters of the calibration node.

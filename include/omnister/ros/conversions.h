@@ -23,6 +23,10 @@ namespace omnister {
 ros::Time toRosTime(device::Stamp stamp);
 device::Stamp fromRosTime(const ros::Time& stamp);
 
+/// Whether sums and differences with other such stamps are times and durations too: ROS throws
+/// where they are not. Until 2038.
+inline bool canReckonWith(const ros::Time& stamp) { return stamp.sec < (std::uint32_t{1} << 31); }
+
 geometry_msgs::Transform toTransform(const Pose& pose);
 /// `child` in `parent`: T_parent_child.
 geometry_msgs::TransformStamped toTransformStamped(const Pose& pose, const ros::Time& stamp,

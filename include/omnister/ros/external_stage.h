@@ -6,7 +6,6 @@
 #include <ros/node_handle.h>
 #include <sensor_msgs/JointState.h>
 #include <tf2_ros/buffer.h>
-#include <tf2_ros/transform_listener.h>
 
 #include <Eigen/Core>
 #include <memory>
@@ -14,6 +13,7 @@
 #include <string>
 
 #include "omnister/device/stage.h"
+#include "omnister/ros/transform_input.h"
 
 namespace omnister {
 
@@ -59,7 +59,7 @@ class ExternalStageSource : public std::enable_shared_from_this<ExternalStageSou
   bool known_ = false;
   std::string problem_;
   std::unique_ptr<tf2_ros::Buffer> buffer_;
-  std::unique_ptr<tf2_ros::TransformListener> listener_;
+  std::unique_ptr<TransformInput> listener_;
   ros::Publisher command_publisher_;
   ros::Subscriber joint_subscriber_;
 };

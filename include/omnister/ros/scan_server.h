@@ -29,6 +29,12 @@
 
 #include "omnister/ros/callback_threads.h"
 
+namespace actionlib {
+/// See action_status.h.
+template <>
+void ActionServer<omnister::ScanAction>::publishStatus();
+}  // namespace actionlib
+
 namespace omnister {
 
 /// Private parameters of the same names.

@@ -32,6 +32,12 @@
 #include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/external_stage.h"
 
+namespace actionlib {
+/// See action_status.h.
+template <>
+void ActionServer<omnister::MoveStageAction>::publishStatus();
+}  // namespace actionlib
+
 namespace omnister {
 
 /// Private parameters of the same names; ranges and units are in the README.

@@ -8,14 +8,15 @@
 #include <geometry_msgs/PointStamped.h>
 #include <image_transport/image_transport.h>
 #include <image_transport/subscriber_filter.h>
+#include <message_filters/pass_through.h>
 #include <message_filters/sync_policies/approximate_time.h>
 #include <message_filters/synchronizer.h>
 #include <omnister/StereoConfig.h>
 #include <ros/ros.h>
 #include <sensor_msgs/PointCloud2.h>
 #include <tf2_ros/buffer.h>
-#include <tf2_ros/transform_listener.h>
 
+#include <array>
 #include <condition_variable>
 #include <map>
 #include <memory>
@@ -34,6 +35,7 @@
 #include "omnister/ros/messages.h"
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/stereo_worker.h"
+#include "omnister/ros/transform_input.h"
 #include "omnister/stereo/matcher.h"
 
 namespace omnister {
@@ -100,6 +102,8 @@ class StereoPipeline {
   void publishLens(const std::string& frame_id);
   void onLens(const LensModelMessage::ConstPtr& message, std::size_t eye);
   void count(const sensor_msgs::Image& image, std::size_t eye);
+  /// Rig: to the synchronizer.
+  void pair(const sensor_msgs::ImageConstPtr& image, std::size_t eye);
   void onImage(const sensor_msgs::ImageConstPtr& image);
   void onImages(const sensor_msgs::ImageConstPtr& left, const sensor_msgs::ImageConstPtr& right);
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
@@ -134,7 +138,7 @@ class StereoPipeline {
   ros::NodeHandle node_;
   image_transport::ImageTransport transport_;
   tf2_ros::Buffer tf_buffer_;
-  std::unique_ptr<tf2_ros::TransformListener> tf_listener_;
+  std::unique_ptr<TransformInput> tf_listener_;
 
   std::mutex connection_mutex_;  ///< subscribers and publishers
   ros::Publisher points_publisher_;
@@ -147,6 +151,7 @@ class StereoPipeline {
   image_transport::Subscriber image_subscriber_;
   std::unique_ptr<image_transport::SubscriberFilter> left_subscriber_;
   std::unique_ptr<image_transport::SubscriberFilter> right_subscriber_;
+  std::array<message_filters::PassThrough<sensor_msgs::Image>, 2> to_synchronizer_;
   std::unique_ptr<message_filters::Synchronizer<SyncPolicy>> synchronizer_;
   std::vector<ros::Subscriber> lens_subscribers_;
   bool subscribed_ = false;
