@@ -621,7 +621,8 @@ TEST(Stereo, ShowsTheLensSurfaceToWhoComesLate) {
   ASSERT_EQ(surface.points.size() % 3, 0u);
   ASSERT_EQ(surface.points.size(), surface.colors.size());
   // Every vertex stands over the pixel that its direction projects to, in one scale.
-  const LensModel& lens = *lensFile().lens;
+  const LensPtr kept = lensFile().lens;
+  const LensModel& lens = *kept;
   double scale = 0.0;
   for (const auto& p : surface.points) {
     const Eigen::Vector3d at(p.x, p.y, p.z);
