@@ -79,7 +79,8 @@ std::string SnapshotServer::save() const {
   const auto range_file = stageRange(range_path_, range);
   cloud_file->commit();
   range_file->commit();
-  const int points_seen = cv::countNonZero(range == range);  // NaN is not equal to itself
+  // NOLINTNEXTLINE(misc-redundant-expression): what is NaN is not equal.
+  const int points_seen = cv::countNonZero(range == range);
   return std::to_string(points_seen) + " points of " + std::to_string(cloud.xyz.total()) +
          " pixels";
 }

@@ -429,7 +429,7 @@ void StageDriver::onGoal(Server::GoalHandle handle) {
     stageLocked().moveTo(target, goal.speed > 0.0 ? goal.speed : parameters_.speed_mps);
     finishLocked(Outcome::kCanceled, "replaced by a new goal");
     handle.setAccepted();
-    goal_.emplace();
+    goal_ = Goal();
     goal_->handle = std::move(handle);
     goal_->target_m = target;
     goal_->reference = reading_.reference;
