@@ -28,7 +28,7 @@
 #include "omnister/ros/view_collector.h"
 
 namespace actionlib {
-/// See action_status.h.
+// See action_status.h.
 template <>
 void ActionServer<omnister::CalibrateAction>::publishStatus();
 }  // namespace actionlib

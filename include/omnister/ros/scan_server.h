@@ -30,7 +30,7 @@
 #include "omnister/ros/callback_threads.h"
 
 namespace actionlib {
-/// See action_status.h.
+// See action_status.h.
 template <>
 void ActionServer<omnister::ScanAction>::publishStatus();
 }  // namespace actionlib

@@ -33,7 +33,7 @@
 #include "omnister/ros/external_stage.h"
 
 namespace actionlib {
-/// See action_status.h.
+// See action_status.h.
 template <>
 void ActionServer<omnister::MoveStageAction>::publishStatus();
 }  // namespace actionlib
