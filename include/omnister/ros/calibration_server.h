@@ -27,11 +27,13 @@
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/view_collector.h"
 
+// See action_status.h; a document of actionlib, not of ours.
+/// @cond
 namespace actionlib {
-// See action_status.h.
 template <>
 void ActionServer<omnister::CalibrateAction>::publishStatus();
 }  // namespace actionlib
+/// @endcond
 
 namespace omnister {
 

@@ -29,11 +29,13 @@
 
 #include "omnister/ros/callback_threads.h"
 
+// See action_status.h; a document of actionlib, not of ours.
+/// @cond
 namespace actionlib {
-// See action_status.h.
 template <>
 void ActionServer<omnister::ScanAction>::publishStatus();
 }  // namespace actionlib
+/// @endcond
 
 namespace omnister {
 

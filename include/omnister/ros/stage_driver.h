@@ -32,11 +32,13 @@
 #include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/external_stage.h"
 
+// See action_status.h; a document of actionlib, not of ours.
+/// @cond
 namespace actionlib {
-// See action_status.h.
 template <>
 void ActionServer<omnister::MoveStageAction>::publishStatus();
 }  // namespace actionlib
+/// @endcond
 
 namespace omnister {
 
