@@ -118,9 +118,12 @@ class BadInput : public testing::Test {
     const cv::Mat ones(48, 64, CV_32FC1, cv::Scalar(1));
     Cloud plane{cv::Mat(48, 64, CV_32FC3), cv::Mat(48, 64, CV_8UC3, cv::Scalar::all(7)), ones,
                 ones};
-    plane.xyz.forEach<cv::Vec3f>([](cv::Vec3f& point, const int* at) {
-      point = {0.05f * static_cast<float>(at[1] - 32), 0.05f * static_cast<float>(at[0] - 24), 2};
-    });
+    for (int v = 0; v < 48; ++v) {
+      for (int u = 0; u < 64; ++u) {
+        plane.xyz.at<cv::Vec3f>(v, u) = {0.05f * static_cast<float>(u - 32),
+                                         0.05f * static_cast<float>(v - 24), 2};
+      }
+    }
     writeCloud("cloud.ply", plane);
     const fs::path source(OMNISTER_SOURCE_DIR);
     fs::copy(source / "config/scenes/plane.yaml", "scene.yaml");
