@@ -10,7 +10,8 @@
 #include <sstream>
 
 #include "omnister/common/numbers.h"
-#include "omnister/lens/lens_part.h"
+#include "omnister/lens/lens_file.h"
+#include "omnister/lens/lens_store.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/live_parameters.h"
 #include "omnister/ros/parameters.h"
@@ -167,13 +168,13 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
     : node_(callbacks_.on(node)),
       parameters_(std::move(parameters)),
       open_(std::move(open)),
+      lens_(node_, parameters_.frame_id, parameters_.store, parameters_.name),
       stretch_began_(Steady::now()),
       settings_(parameters_.settings),
       last_frame_(Steady::now()),
       private_node_(callbacks_.on(private_node)),
       diagnostics_(node, private_node, private_node.getNamespace()) {
-  lens_publisher_ = node_.advertise<LensModelMessage>("lens_model", 1, true);
-  if (!parameters_.lens.empty()) setLens(readLensFile(parameters_.lens));
+  if (!parameters_.lens.empty()) lens_.set(readLensFile(parameters_.lens));
   if (!parameters_.parent_frame_id.empty()) {
     static_frames_ = StaticFrames::shared();
     const ros::Time now = ros::Time::now();
@@ -183,10 +184,6 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
     static_frames_->add(toTransformStamped(opticalInLink(), now, link, parameters_.frame_id));
   }
   images_ = image_transport::ImageTransport(node_).advertiseCamera("image_raw", 4);
-  set_camera_info_ = node_.advertiseService("set_camera_info", &CameraDriver::setCameraInfo, this);
-  list_lenses_ = node_.advertiseService("list_lenses", &CameraDriver::listLenses, this);
-  roll_back_lens_ = node_.advertiseService("roll_back_lens", &CameraDriver::rollBackLens, this);
-  lens_subscriber_ = node_.subscribe("lens_model", 1, &CameraDriver::onLens, this);
   diagnostics_.setHardwareID("none");
   diagnostics_.add("camera", this, &CameraDriver::diagnose);
   trigger_ = node_.advertiseService("trigger", &CameraDriver::onTrigger, this);
@@ -284,7 +281,7 @@ void CameraDriver::openIfNeeded() {
   takeRemarks();
   takeControls(camera_->controls());
   statistics_due_ = Steady::time_point();
-  chooseLens();
+  lens_.choose(identity.serial, camera_->lensFile());
 }
 
 void CameraDriver::close(const std::string& problem) {
@@ -576,17 +573,7 @@ void CameraDriver::countLost(const device::Frame& frame) {
 }
 
 void CameraDriver::publish(const device::Frame& frame) {
-  bool moved = false;
-  {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    const auto same = [](const device::SensorRegion& a, const device::SensorRegion& b) {
-      return a.sensor == b.sensor && a.region == b.region && a.binning == b.binning;
-    };
-    moved = frame.region && (!region_ || !same(*region_, *frame.region));
-    if (moved) region_ = frame.region;
-  }
-  if (moved) publishLens();
-  const sensor_msgs::CameraInfoPtr info = infoFor(frame);
+  const sensor_msgs::CameraInfoPtr info = lens_.infoFor(frame);
   const sensor_msgs::ImagePtr image = toMessage(frame);
   image->header.stamp = toRosTime(frame.stamp);
   image->header.frame_id = parameters_.frame_id;
@@ -595,46 +582,6 @@ void CameraDriver::publish(const device::Frame& frame) {
   info->header = image->header;
   publishRecordedStage(frame, image->header.stamp);
   images_.publish(image, info);
-}
-
-sensor_msgs::CameraInfoPtr CameraDriver::infoFor(const device::Frame& frame) const {
-  std::shared_ptr<const Lens> lens;
-  {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    lens = lens_;
-  }
-  auto info = boost::make_shared<sensor_msgs::CameraInfo>();
-  const cv::Size size = frame.image.size();
-  const bool part = frame.region && !frame.region->whole();
-  if (lens && lens->file.image_size == size) {
-    // Calibrated as it streams, a part of the sensor or not.
-    *info = lens->info;
-    return info;
-  }
-  if (lens && part && lens->file.image_size == frame.region->sensor) {
-    *info = lens->info;
-  } else {
-    if (lens) {
-      ROS_ERROR_STREAM_THROTTLE(30.0, "the lens is of " << lens->file.image_size.width << "x"
-                                                        << lens->file.image_size.height
-                                                        << " pixels, the images have " << size.width
-                                                        << "x" << size.height
-                                                        << ": published without calibration");
-    }
-    const cv::Size whole = part ? frame.region->sensor : size;
-    *info = uncalibratedCameraInfo(whole.width, whole.height);
-  }
-  if (part) {
-    // REP 104: the calibration is of the whole sensor, the image a part of it.
-    const device::SensorRegion& region = *frame.region;
-    info->binning_x = static_cast<std::uint32_t>(region.binning.width);
-    info->binning_y = static_cast<std::uint32_t>(region.binning.height);
-    info->roi.x_offset = static_cast<std::uint32_t>(region.region.x);
-    info->roi.y_offset = static_cast<std::uint32_t>(region.region.y);
-    info->roi.width = static_cast<std::uint32_t>(region.region.width);
-    info->roi.height = static_cast<std::uint32_t>(region.region.height);
-  }
-  return info;
 }
 
 void CameraDriver::publishRecordedStage(const device::Frame& frame, const ros::Time& stamp) {
@@ -668,134 +615,9 @@ void CameraDriver::publishRecordedStage(const device::Frame& frame, const ros::T
   stage_publisher_.publish(state);
 }
 
-std::string CameraDriver::storeName() const {
-  if (!parameters_.name.empty()) return parameters_.name;
-  const std::lock_guard<std::mutex> lock(mutex_);
-  return LensStore::nameFrom(identity_.serial);
-}
-
-void CameraDriver::chooseLens() {
-  {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    if (lens_) return;
-  }
-  try {
-    if (std::optional<LensFile> stored = LensStore(parameters_.store).load(storeName())) {
-      setLens(std::move(*stored));
-    } else if (const auto recorded = camera_->lensFile()) {
-      setLens(readLensFile(*recorded));
-    } else {
-      ROS_INFO("no calibration of this camera yet");
-    }
-  } catch (const std::exception& e) {
-    ROS_ERROR_STREAM("starting without calibration: " << printable(e.what(), 1000));
-    const std::lock_guard<std::mutex> lock(mutex_);
-    lens_problem_ = printable(e.what(), 1000);
-  }
-}
-
-void CameraDriver::setLens(LensFile file) {
-  auto lens = std::make_shared<Lens>();
-  lens->info = toCameraInfo(file);
-  lens->file = std::move(file);
-  {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    lens_ = std::move(lens);
-    lens_problem_.clear();
-  }
-  publishLens();
-}
-
-bool CameraDriver::lensIsOfMore() const {
-  return lens_ && region_ && !region_->whole() && lens_->file.image_size == region_->sensor;
-}
-
-void CameraDriver::publishLens() {
-  try {
-    std_msgs::Header header;
-    header.stamp = ros::Time::now();
-    header.frame_id = parameters_.frame_id;
-    const std::lock_guard<std::mutex> lock(mutex_);
-    if (!lens_) return;
-    const LensModelMessage message = toLensModelMessage(
-        lensIsOfMore() ? partOfLens(lens_->file, region_->region, region_->binning) : lens_->file,
-        header);
-    if (message.yaml == published_lens_) return;
-    published_lens_ = message.yaml;
-    lens_publisher_.publish(message);
-  } catch (const Error& e) {
-    ROS_ERROR_STREAM("lens_model: " << printable(e.what(), 1000));
-  }
-}
-
-void CameraDriver::onLens(const LensModelMessage::ConstPtr& message) {
-  try {
-    if (message->header.frame_id != parameters_.frame_id) return;
-    {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      if (message->yaml == published_lens_) return;
-    }
-    // Published again by us, so that the latched messages of both agree.
-    setLens(fromLensModelMessage(*message, "lens_model"));
-    ROS_INFO("took over a new calibration");
-  } catch (const std::exception& e) {
-    ROS_WARN_STREAM_THROTTLE(10.0, "lens_model refused: " << printable(e.what(), 1000));
-  }
-}
-
-bool CameraDriver::setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
-                                 sensor_msgs::SetCameraInfo::Response& response) {
-  try {
-    LensFile file = fromCameraInfo(request.camera_info, "set_camera_info");
-    file.camera_name = storeName();
-    const std::filesystem::path path = LensStore(parameters_.store).save(file.camera_name, file);
-    setLens(std::move(file));
-    response.success = true;
-    response.status_message = "saved as " + path.string();
-    ROS_INFO_STREAM("calibration " << response.status_message);
-  } catch (const std::exception& e) {
-    response.success = false;
-    response.status_message = e.what();
-    ROS_WARN_STREAM("set_camera_info refused: " << printable(e.what(), 1000));
-  }
-  return true;
-}
-
-bool CameraDriver::listLenses(ListLenses::Request&, ListLenses::Response& response) {
-  try {
-    for (const StoredLens& stored : LensStore(parameters_.store).versions(storeName())) {
-      response.versions.push_back(stored.version);
-      response.descriptions.push_back(describe(stored));
-      if (stored.current) response.current = stored.version;
-    }
-    response.success = true;
-  } catch (const std::exception& e) {
-    response.message = printable(e.what(), 1000);
-  }
-  return true;
-}
-
-bool CameraDriver::rollBackLens(RollBackLens::Request& request, RollBackLens::Response& response) {
-  try {
-    if (request.version < 0) throw InputError("roll_back_lens", "version", "is negative");
-    StoredLens stored =
-        LensStore(parameters_.store)
-            .rollBack(storeName(),
-                      request.version == 0 ? std::nullopt : std::optional<int>(request.version));
-    response.message = describe(stored);
-    response.version = stored.version;
-    setLens(std::move(*stored.file));
-    response.success = true;
-    ROS_INFO_STREAM("calibration rolled back to " << response.message);
-  } catch (const std::exception& e) {
-    response.message = printable(e.what(), 1000);
-    ROS_WARN_STREAM("roll_back_lens refused: " << response.message);
-  }
-  return true;
-}
-
 void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
   using diagnostic_msgs::DiagnosticStatus;
+  const CameraLens::Calibrated calibrated = lens_.calibrated();
   const std::lock_guard<std::mutex> lock(mutex_);
   const double seconds = secondsSince(stretch_began_);
   if (seconds >= kStretch) {
@@ -812,7 +634,7 @@ void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status)
   } else if (lost_lately_ > 0) {
     status.summary(DiagnosticStatus::WARN,
                    "frames get lost: " + std::to_string(lost_lately_) + " just now");
-  } else if (!lens_ && !lens_problem_.empty()) {
+  } else if (!calibrated.yes && !calibrated.problem.empty()) {
     status.summary(DiagnosticStatus::WARN, "the stored calibration cannot be used");
   } else {
     status.summary(DiagnosticStatus::OK, state_);
@@ -831,7 +653,9 @@ void CameraDriver::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status)
   if (statistics_.temperature_c) status.add("temperature [C]", *statistics_.temperature_c);
   status.add("failed attempts and losses of the device", losses_of_device_);
   status.add("last problem", printable(problem_));
-  status.add("calibrated", lens_ ? "yes" : lens_problem_.empty() ? "no" : "no: " + lens_problem_);
+  status.add("calibrated", calibrated.yes               ? "yes"
+                           : calibrated.problem.empty() ? "no"
+                                                        : "no: " + calibrated.problem);
 }
 
 }  // namespace omnister

@@ -71,7 +71,10 @@ cv::Mat convert(const sensor_msgs::Image& image, int bits, const std::string& wa
 }  // namespace
 
 std::uint32_t MissingMessages::before(const std_msgs::Header& header) {
-  if (header.stamp < stamp_) return 0;
+  constexpr int kLate = 4;  // what publishers of images keep in their queues
+  older_ = header.stamp < stamp_ ? older_ + 1 : 0;
+  if (older_ > kLate) reset();
+  if (older_ > 0) return 0;
   stamp_ = header.stamp;
   const std::uint32_t last = std::exchange(last_, header.seq);
   return last != 0 && header.seq > last ? header.seq - last - 1 : 0;

@@ -9,22 +9,22 @@
 namespace omnister {
 
 TransformInput::TransformInput(tf2_ros::Buffer& buffer) : buffer_(buffer) {
-  node_.setCallbackQueue(&queue_);
+  ros::NodeHandle node = callbacks_.on(ros::NodeHandle());
   using Event = ros::MessageEvent<const tf2_msgs::TFMessage>;
-  const auto subscribe = [this](const char* topic, bool is_static) {
+  const auto subscribe = [this, &node](const char* topic, bool is_static) {
     const boost::function<void(const Event&)> callback = [this, is_static](const Event& event) {
       take(event, is_static);
     };
-    return node_.subscribe<tf2_msgs::TFMessage>(topic, 100, callback);
+    return node.subscribe<tf2_msgs::TFMessage>(topic, 100, callback);
   };
   moving_ = subscribe("/tf", false);
   fixed_ = subscribe("/tf_static", true);
   buffer_.setUsingDedicatedThread(true);
-  spinner_.start();
+  callbacks_.start();
 }
 
 TransformInput::~TransformInput() {
-  spinner_.stop();
+  callbacks_.stop();
   buffer_.setUsingDedicatedThread(false);
 }
 

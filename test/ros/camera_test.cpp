@@ -17,6 +17,7 @@
 #include "child_process.h"
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_models.h"
+#include "omnister/lens/lens_store.h"
 #include "omnister/ros/camera_driver.h"
 #include "omnister/ros/conversions.h"
 #include "ros/ros_test.h"

@@ -60,6 +60,9 @@ TEST(MissingMessages, AreCountedByNumbersOfMessagesThatFollowEachOther) {
   EXPECT_EQ(before(25, 1.5), 0U);
   EXPECT_EQ(before(1, 1.6), 0U);  // the publisher began anew
   EXPECT_EQ(before(3, 1.8), 1U);
+  // The clock was set back.
+  for (std::uint32_t i = 0; i < 6; ++i) EXPECT_EQ(before(4 + i, 0.2 + 0.1 * i), 0U) << i;
+  EXPECT_EQ(before(12, 1.0), 2U);
   missing.reset();
   EXPECT_EQ(before(50, 0.1), 0U);
 }

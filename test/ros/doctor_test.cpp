@@ -10,6 +10,8 @@
 #include <opencv2/core.hpp>
 #include <thread>
 
+#include "child_process.h"
+#include "omnister/common/file_io.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/doctor_facts.h"
@@ -174,6 +176,21 @@ TEST(DoctorAnswers, WithinItsTimeWhateverTheAddress) {
   EXPECT_FALSE(answers("http://no-such-host.invalid:11311/"));
   EXPECT_FALSE(answers(""));
   EXPECT_FALSE(answers("http://nothing"));
+}
+
+TEST(DoctorNode, FailsWhereItsFindingsCannotBeWritten) {
+  const TemporaryFolder folder;
+  const std::string said = (folder.path() / "said").string();
+  for (const char* output : {"", " --json"}) {
+    std::filesystem::remove(said);
+    test::ChildProcess doctor(
+        {"/bin/sh", "-c",
+         "ROS_MASTER_URI=http://localhost:1/ exec \"$0\"" + std::string(output) + " >/dev/full",
+         OMNISTER_DOCTOR_NODE},
+        said);
+    EXPECT_EQ(doctor.wait(), 1) << output;
+    EXPECT_EQ(readFile(said), "omnister: cannot write to standard output\n") << output;
+  }
 }
 
 }  // namespace

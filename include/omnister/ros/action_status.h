@@ -12,26 +12,20 @@
 
 namespace omnister::detail {
 
-/// Stamps that are ahead of time become the present.
-template <typename Statuses>
-void keepToThePresent(Statuses& statuses, ros::Time& last_cancel) {
-  const ros::Time now = ros::Time::now();
-  for (auto& status : statuses)
-    if (status.handle_destruction_time_ > now) status.handle_destruction_time_ = now;
-  if (last_cancel > now) last_cancel = now;
-}
-
-/// What actionlib's publishStatus() publishes, with such stamps. A server's own lock is held.
+/// What actionlib's publishStatus() publishes; stamps that are ahead of time become the present. A
+/// server's own lock is held.
 template <typename Statuses>
 actionlib_msgs::GoalStatusArray actionStatus(Statuses& statuses, ros::Time& last_cancel,
                                              const ros::Duration& timeout) {
-  keepToThePresent(statuses, last_cancel);
+  const ros::Time now = ros::Time::now();
+  if (last_cancel > now) last_cancel = now;
   actionlib_msgs::GoalStatusArray message;
-  message.header.stamp = ros::Time::now();
+  message.header.stamp = now;
   for (auto status = statuses.begin(); status != statuses.end();) {
     message.status_list.push_back(status->status_);
-    const ros::Time& end = status->handle_destruction_time_;
-    const bool over = !end.isZero() && end + timeout < message.header.stamp;
+    ros::Time& end = status->handle_destruction_time_;
+    if (end > now) end = now;
+    const bool over = !end.isZero() && end + timeout < now;
     status = over ? statuses.erase(status) : std::next(status);
   }
   return message;

@@ -17,7 +17,6 @@
 #include <dynamic_reconfigure/server.h>
 #include <image_transport/camera_publisher.h>
 #include <ros/node_handle.h>
-#include <sensor_msgs/SetCameraInfo.h>
 #include <std_srvs/Trigger.h>
 #include <tf2_ros/transform_broadcaster.h>
 
@@ -33,14 +32,10 @@
 #include <thread>
 
 #include "omnister/CameraConfig.h"
-#include "omnister/ListLenses.h"
-#include "omnister/RollBackLens.h"
 #include "omnister/common/pose.h"
 #include "omnister/device/camera.h"
-#include "omnister/lens/lens_file.h"
-#include "omnister/lens/lens_store.h"
 #include "omnister/ros/callback_threads.h"
-#include "omnister/ros/messages.h"
+#include "omnister/ros/camera_lens.h"
 #include "omnister/ros/static_frames.h"
 
 namespace omnister {
@@ -90,10 +85,6 @@ class CameraDriver {
 
  private:
   using Task = std::function<void(device::Camera*)>;
-  struct Lens {
-    LensFile file;
-    sensor_msgs::CameraInfo info;
-  };
 
   void run();
   void stream();
@@ -104,7 +95,6 @@ class CameraDriver {
   bool wanted();
   void waitFor(double seconds);
   void publish(const device::Frame& frame);
-  sensor_msgs::CameraInfoPtr infoFor(const device::Frame& frame) const;
   void publishRecordedStage(const device::Frame& frame, const ros::Time& stamp);
   void takeRemarks();
   void countLost(const device::Frame& frame);
@@ -125,33 +115,17 @@ class CameraDriver {
   bool onTrigger(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   void takeControls(const device::CameraControls& controls);
 
-  void chooseLens();
-  void setLens(LensFile file);
-  /// The lens of the images that come: of the part of the sensor that they show.
-  void publishLens();
-  /// The images show a part of the sensor, and the lens is of all of it.
-  bool lensIsOfMore() const;
-  /// Takes over a lens that a calibration publishes beside us.
-  void onLens(const LensModelMessage::ConstPtr& message);
-  bool setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
-                     sensor_msgs::SetCameraInfo::Response& response);
-  bool listLenses(ListLenses::Request& request, ListLenses::Response& response);
-  bool rollBackLens(RollBackLens::Request& request, RollBackLens::Response& response);
-  std::string storeName() const;
   void diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
   CallbackThreads callbacks_;  // before all that uses it
   ros::NodeHandle node_;
   const CameraParameters parameters_;
   const OpenCamera open_;
+  CameraLens lens_;
 
   // Guarded by mutex_: what callbacks and the device thread share.
   mutable std::mutex mutex_;
   std::condition_variable wake_;
-  std::shared_ptr<const Lens> lens_;
-  std::optional<device::SensorRegion> region_;  // of the last frame
-  std::string published_lens_;
-  std::string lens_problem_;  // why there is none, where the store holds one
   device::CameraIdentity identity_;
   std::string state_ = "opening";  // by setState(), which reports
   std::string problem_;
@@ -193,12 +167,7 @@ class CameraDriver {
   std::shared_ptr<StaticFrames> static_frames_;
   tf2_ros::TransformBroadcaster transforms_;
   image_transport::CameraPublisher images_;
-  ros::Publisher lens_publisher_;
   ros::Publisher stage_publisher_;
-  ros::Subscriber lens_subscriber_;
-  ros::ServiceServer set_camera_info_;
-  ros::ServiceServer list_lenses_;
-  ros::ServiceServer roll_back_lens_;
   ros::ServiceServer trigger_;
   ros::NodeHandle private_node_;
   boost::recursive_mutex config_mutex_;

@@ -34,13 +34,15 @@ class MissingMessages {
  public:
   /// @return how many are missing between the message before and this one; 0 for the first, for
   /// numbers that begin anew, for publishers that give none, and for an older message: roscpp may
-  /// deliver one from before the subscription late, with another number
+  /// deliver one from before the subscription late, with another number. Where older ones go on to
+  /// come, the clock was set back, and they are counted from there
   std::uint32_t before(const std_msgs::Header& header);
   void reset() { *this = MissingMessages(); }
 
  private:
   std::uint32_t last_ = 0;
   ros::Time stamp_;
+  int older_ = 0;  ///< in a row
 };
 
 }  // namespace omnister

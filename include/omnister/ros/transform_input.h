@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <ros/callback_queue.h>
-#include <ros/ros.h>
+#include <ros/message_event.h>
+#include <ros/node_handle.h>
 #include <tf2_msgs/TFMessage.h>
 #include <tf2_ros/buffer.h>
+
+#include "omnister/ros/callback_threads.h"
 
 namespace omnister {
 
@@ -21,12 +23,10 @@ class TransformInput {
  private:
   void take(const ros::MessageEvent<const tf2_msgs::TFMessage>& event, bool is_static);
 
+  CallbackThreads callbacks_;  // before all that uses it
   tf2_ros::Buffer& buffer_;
   ros::Time newest_;  ///< time of the message before
-  ros::CallbackQueue queue_;
-  ros::NodeHandle node_;
   ros::Subscriber moving_, fixed_;
-  ros::AsyncSpinner spinner_{1, &queue_};
 };
 
 }  // namespace omnister
