@@ -59,7 +59,7 @@ CalibrationParameters loadCalibrationParameters(Parameters& parameters) {
   CalibrationParameters result;
   const std::string target = parameters.text("target", "");
   if (target.empty()) throw InputError("~target", "", "is not set, expected a TARGET.yaml");
-  result.target = readTarget(target);
+  result.target = parameters.file("target", target, readTarget);
   result.model = parameters.text("model", result.model);
   if (!knownModel(result.model))
     throw InputError("~model", "",
@@ -269,14 +269,14 @@ void CalibrationServer::moveTo(double position) {
     if ((ros::SteadyTime::now() - start).toSec() > kMoveTimeout) {
       mover_->cancelGoal();
       moving_ = false;
-      throw Error("the stage did not arrive at " + std::to_string(position) + " m in time");
+      throw Error("the stage did not arrive at " + formatNumber(position) + " m in time");
     }
   }
   moving_ = false;
   const auto result = mover_->getResult();
   if (mover_->getState() != actionlib::SimpleClientGoalState::SUCCEEDED || !result ||
       !result->success)
-    throw Error("the stage did not move to " + std::to_string(position) + " m: " +
+    throw Error("the stage did not move to " + formatNumber(position) + " m: " +
                 printable(result && !result->message.empty() ? result->message
                                                              : mover_->getState().getText()));
 }
@@ -347,8 +347,8 @@ CalibrateResult CalibrationServer::calibrateOnce(const CalibrateGoal& goal) {
       if (collector_) detections = collector_->detections();
       const int images = collector_ ? collector_->images() : 0;
       message = std::to_string(detections.views.size()) + " of " + std::to_string(views) +
-                " views within " + std::to_string(static_cast<int>(timeout)) + " s, from " +
-                std::to_string(images) + " images on " + node_.resolveName("image_raw") +
+                " views within " + formatNumber(timeout) + " s, from " + std::to_string(images) +
+                " images on " + node_.resolveName("image_raw") +
                 (last_problem_.empty() ? "" : " (" + last_problem_ + ")");
     }
     if (!detections.views.empty())

@@ -95,6 +95,7 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   Parameters source(private_node);
   CameraParameters p;
   p.device = source.text("device", p.device);
+  source.file("device", p.device, device::checkCameraDevice);
   p.frame_id = source.frame("frame_id", p.frame_id);
   const std::string url = source.text("camera_info_url", "");
   p.lens = source.text("lens", pathOfUrl(url));
@@ -130,6 +131,11 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   p.settings.binning.width = source.integer("binning_x", 0, 0, 16);
   p.settings.binning.height = source.integer("binning_y", 0, 0, 16);
   p.settings.features = source.texts("features");
+  for (const std::string& feature : p.settings.features) {
+    if (feature.find('=') != std::string::npos) continue;
+    throw InputError("parameter " + private_node.resolveName("features"), "",
+                     "has \"" + printable(feature) + "\", expected Name=value");
+  }
   p.settings.buffers = source.integer("buffers", p.settings.buffers, 2, 256);
   p.settings.stamp_offset_us = source.number("stamp_offset_us", 0.0, -1e6, 1e6, "us");
   p.settings.stamp_is_exposure_end =
@@ -174,7 +180,9 @@ CameraDriver::CameraDriver(const ros::NodeHandle& node, const ros::NodeHandle& p
       last_frame_(Steady::now()),
       private_node_(callbacks_.on(private_node)),
       diagnostics_(node, private_node, private_node.getNamespace()) {
-  if (!parameters_.lens.empty()) lens_.set(readLensFile(parameters_.lens));
+  if (!parameters_.lens.empty()) {
+    lens_.set(fromFileOf(private_node, "lens", [this] { return readLensFile(parameters_.lens); }));
+  }
   if (!parameters_.parent_frame_id.empty()) {
     static_frames_ = StaticFrames::shared();
     const ros::Time now = ros::Time::now();

@@ -1,22 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <nodelet/nodelet.h>
-
-#include <memory>
 #include <pluginlib/class_list_macros.hpp>
 
 #include "omnister/ros/camera_driver.h"
+#include "server_nodelet.h"
 
 namespace omnister {
+namespace {
 
-class CameraNodelet : public nodelet::Nodelet {
- private:
-  void onInit() override {
-    driver_ = std::make_unique<CameraDriver>(getNodeHandle(), getPrivateNodeHandle(),
-                                             loadCameraParameters(getPrivateNodeHandle()));
-  }
-
-  std::unique_ptr<CameraDriver> driver_;
+/// Its callbacks have a queue of their own.
+struct Camera {
+  Camera(const ros::NodeHandle& node, const ros::NodeHandle& private_node)
+      : driver(node, private_node, loadCameraParameters(private_node)) {}
+  CameraDriver driver;
 };
+
+}  // namespace
+
+class CameraNodelet : public ServerNodelet<Camera> {};
 
 }  // namespace omnister
 

@@ -9,12 +9,15 @@
 #include <algorithm>
 #include <cstdlib>
 #include <iostream>
+#include <memory>
 #include <nlohmann/json.hpp>
 #include <utility>
 
 #include "omnister/common/error.h"
 #include "omnister/ros/diagnostic_pace.h"
 #include "omnister/ros/doctor_facts.h"
+#include "omnister/ros/logger_service.h"
+#include "run_node.h"
 
 namespace omnister {
 namespace {
@@ -144,6 +147,7 @@ int run(int argc, char** argv) {
   ::setenv("ROS_MASTER_URI", "http://localhost:11311", 0);
   ros::init(argc, argv, "doctor",
             keep_watching ? 0 : ros::init_options::AnonymousName | ros::init_options::NoRosout);
+  endBySignals();
   // Its own words are its findings.
   if (ros::console::set_logger_level(ROSCONSOLE_DEFAULT_NAME, ros::console::levels::Fatal))
     ros::console::notifyLoggerLevelsChanged();
@@ -153,6 +157,7 @@ int run(int argc, char** argv) {
   if (facts.master) {
     ros::AsyncSpinner spinner(2);
     spinner.start();
+    const std::shared_ptr<LoggerService> loggers = LoggerService::shared();
     options.passive = keep_watching;
     if (keep_watching) {
       watch(options, period);

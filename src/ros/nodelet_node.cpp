@@ -11,10 +11,12 @@
 
 #include <algorithm>
 #include <atomic>
+#include <memory>
 #include <string>
 #include <utility>
 
 #include "omnister/common/error.h"
+#include "omnister/ros/logger_service.h"
 
 namespace {
 
@@ -90,6 +92,7 @@ class Keeper {
   }
 
   ros::NodeHandle node_;
+  const std::shared_ptr<omnister::LoggerService> loggers_ = omnister::LoggerService::shared();
   const std::string type_;
   std::string list_;
   std::string load_;
@@ -106,6 +109,7 @@ int main(int argc, char** argv) {
   }
   signal(SIGINT, onSignal);
   signal(SIGTERM, onSignal);
+  if (signal(SIGHUP, onSignal) == SIG_IGN) signal(SIGHUP, SIG_IGN);
   Keeper keeper(argv[1], argv[2]);
   if (keeper.run()) return 0;
   ROS_FATAL("the manager %s does not load %s: it says why",

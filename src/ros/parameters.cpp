@@ -12,6 +12,8 @@
 namespace omnister {
 namespace {
 
+constexpr std::size_t kLongestFrame = 255;
+
 std::string shown(XmlRpc::XmlRpcValue value) {
   if (value.getType() == XmlRpc::XmlRpcValue::TypeString) {
     return "\"" + printable(static_cast<std::string&>(value)) + "\"";
@@ -150,9 +152,11 @@ std::string Parameters::frame(const std::string& key, const std::string& fallbac
   const bool plain = std::none_of(name.begin(), name.end(), [](unsigned char c) {
     return std::isspace(c) != 0 || std::iscntrl(c) != 0;
   });
-  if ((name.empty() && !fallback.empty()) || (!name.empty() && name[0] == '/') || !plain) {
-    refuse(key, "is \"" + printable(name) +
-                    "\", expected a frame name without blanks or a leading slash");
+  if ((name.empty() && !fallback.empty()) || (!name.empty() && name[0] == '/') || !plain ||
+      name.size() > kLongestFrame) {
+    refuse(key, "is \"" + printable(name) + "\", expected a frame name of at most " +
+                    std::to_string(kLongestFrame) +
+                    " characters, without blanks or a leading slash");
   }
   return name;
 }

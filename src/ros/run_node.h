@@ -4,9 +4,13 @@
 #include <ros/callback_queue.h>
 #include <ros/ros.h>
 
+#include <csignal>
+#include <initializer_list>
+#include <memory>
 #include <string>
 
 #include "omnister/common/error.h"
+#include "omnister/ros/logger_service.h"
 
 namespace omnister {
 
@@ -19,13 +23,24 @@ bool spinWhile(const Condition& well) {
   return well();
 }
 
+/// A node that is terminated, or whose terminal is closed, ends as after Ctrl-C: with the stage
+/// stopped. A signal that whoever started it has switched off (nohup) stays off.
+inline void endBySignals() {
+  for (const int number : {SIGTERM, SIGHUP}) {
+    if (std::signal(number, [](int) { ros::requestShutdown(); }) == SIG_IGN)
+      std::signal(number, SIG_IGN);
+  }
+}
+
 /// main() of a node. `body` gets the handle of the node's namespace and the private one, and says
 /// whether all went well. @return the exit code: 1 also for what it throws, which the log tells
 template <typename Body>
 int runNode(int argc, char** argv, const std::string& name, const Body& body) {
   ros::init(argc, argv, name);
+  endBySignals();
   // Without any handle ROS ends, and with it its log: the reason why would not be told.
   const ros::NodeHandle keep;
+  const std::shared_ptr<LoggerService> loggers = LoggerService::shared();
   try {
     return body(ros::NodeHandle(), ros::NodeHandle("~")) ? 0 : 1;
   } catch (const std::exception& error) {

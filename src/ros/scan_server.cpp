@@ -38,6 +38,10 @@ constexpr double kRemembered = 20.0;    // readings of the stage are kept this l
 constexpr std::size_t kMostStops = 10000;
 // Images wait for a reading of the stage after them; more of them means that none comes.
 constexpr std::size_t kMostWaiting = 100;
+constexpr std::size_t kMostBytesWaiting = std::size_t{1} << 30;
+constexpr std::size_t kMostReadings = 20000;
+constexpr std::size_t kMostFrames = 100000;
+constexpr double kFarthest = 1e4;  // what is farther away is no reading of a stage [m]
 constexpr double kSlack = 1e-9;
 
 double age(const ros::SteadyTime& since) { return (ros::SteadyTime::now() - since).toSec(); }
@@ -69,6 +73,7 @@ std::vector<double> stopsOf(const ScanGoal& goal) {
   finite("step", goal.step);
   finite("speed", goal.speed);
   if (goal.speed < 0.0) refuse("speed", "is negative");
+  if (goal.frames > kMostFrames) refuse("frames", "are more than 100000");
   for (const double position : goal.positions) finite("positions", position);
   if (goal.positions.size() > kMostStops) refuse("positions", "are more than 10000");
   if (!goal.positions.empty()) return goal.positions;
@@ -112,9 +117,12 @@ void ScanServer::onImage(const sensor_msgs::ImageConstPtr& image) {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     waiting_.push_back({image, ros::SteadyTime::now()});
-    if (waiting_.size() > kMostWaiting) {
+    std::size_t bytes = 0;
+    for (const Waiting& waiting : waiting_) bytes += waiting.image->data.size();
+    for (; waiting_.size() > kMostWaiting || (bytes > kMostBytesWaiting && waiting_.size() > 1);
+         ++dropped_) {
+      bytes -= waiting_.front().image->data.size();
       waiting_.pop_front();
-      ++dropped_;
     }
   }
   wake_.notify_all();
@@ -125,13 +133,20 @@ void ScanServer::onState(const StageState::ConstPtr& state) {
     const std::lock_guard<std::mutex> lock(mutex_);
     const ros::Time stamp = state->header.stamp;
     if (!canReckonWith(stamp)) return;
-    if (!readings_.empty() && stamp < readings_.back().header.stamp) readings_.clear();
-    if (!readings_.empty() && stamp == readings_.back().header.stamp) {
-      readings_.back() = *state;
-    } else {
-      readings_.push_back(*state);
+    if (!(std::abs(state->position) <= kFarthest)) return;
+    if (!readings_.empty() && stamp < readings_.back().stamp) readings_.clear();
+    if (readings_.empty() || stamp != readings_.back().stamp) readings_.emplace_back();
+    Reading& reading = readings_.back();
+    reading.stamp = stamp;
+    reading.position = state->position;
+    reading.velocity = state->velocity;
+    reading.moving = state->moving;
+    reading.homed = state->homed;
+    reading.faulty = !state->fault.empty();
+    while ((stamp - readings_.front().stamp).toSec() > kRemembered ||
+           readings_.size() > kMostReadings) {
+      readings_.pop_front();
     }
-    while ((stamp - readings_.front().header.stamp).toSec() > kRemembered) readings_.pop_front();
   }
   wake_.notify_all();
 }
@@ -199,6 +214,7 @@ void ScanServer::run(const ScanGoal& goal) {
   last_gray_.release();
   last_obstacle_.clear();
   encoding_.clear();
+  size_ = {};
   index_ = stops_ = settled_here_ = 0;
   sweeping_ = false;
   folder_.clear();
@@ -327,7 +343,7 @@ void ScanServer::runSweep(const ScanGoal& goal) {
     tagWaiting();
     {
       const std::lock_guard<std::mutex> lock(mutex_);
-      const bool read = !readings_.empty() && readings_.back().header.stamp > end;
+      const bool read = !readings_.empty() && readings_.back().stamp > end;
       if (read && (waiting_.empty() || waiting_.front().image->header.stamp > end)) break;
     }
     pause();
@@ -351,12 +367,12 @@ void ScanServer::tagWaiting() {
 
 bool ScanServer::restsAround(const ros::Time& stamp, bool* later) const {
   const ros::Duration around(parameters_.settle_time_s);
-  *later = readings_.empty() || readings_.back().header.stamp < stamp + around;
-  const StageState* before = nullptr;
+  *later = readings_.empty() || readings_.back().stamp < stamp + around;
+  const Reading* before = nullptr;
   double low = INFINITY, high = -INFINITY;
   bool moving = false;
-  for (const StageState& reading : readings_) {
-    const ros::Time time = reading.header.stamp;
+  for (const Reading& reading : readings_) {
+    const ros::Time time = reading.stamp;
     if (time <= stamp - around) {
       // The last one before tells of the beginning.
       before = &reading;
@@ -366,7 +382,7 @@ bool ScanServer::restsAround(const ros::Time& stamp, bool* later) const {
     }
     low = std::min(low, reading.position);
     high = std::max(high, reading.position);
-    moving = moving || reading.moving || !reading.fault.empty();
+    moving = moving || reading.moving || reading.faulty;
     if (time >= stamp + around) break;
   }
   return before != nullptr && !moving && high - low <= parameters_.settle_distance_m + kSlack;
@@ -383,14 +399,13 @@ bool ScanServer::tag(const sensor_msgs::ImageConstPtr& image, bool patient) {
     rests = restsAround(stamp, &later);
     if (later && patient) return false;
     const auto after = std::find_if(readings_.begin(), readings_.end(),
-                                    [&](const StageState& r) { return r.header.stamp >= stamp; });
+                                    [&](const Reading& r) { return r.stamp >= stamp; });
     if (after != readings_.end() && after != readings_.begin()) {
-      const StageState& last = *(after - 1);
-      const double share =
-          (stamp - last.header.stamp).toSec() / (after->header.stamp - last.header.stamp).toSec();
+      const Reading& last = *(after - 1);
+      const double share = (stamp - last.stamp).toSec() / (after->stamp - last.stamp).toSec();
       tagged.frame.position = last.position + share * (after->position - last.position);
       tagged.frame.velocity = last.velocity + share * (after->velocity - last.velocity);
-      known = last.homed && after->homed && last.fault.empty() && after->fault.empty();
+      known = last.homed && after->homed && !last.faulty && !after->faulty;
     }
   }
   // An image without a position is of no use to anybody.
@@ -427,6 +442,10 @@ bool ScanServer::tag(const sensor_msgs::ImageConstPtr& image, bool patient) {
   if (!folder_.empty() && (sweeping_ || (tagged.frame.settled && here))) keep(*image, &tagged);
   frame_publisher_.publish(tagged.frame);
   if (tagged.frame.settled) image_publisher_.publish(image);
+  if (tagged_.size() >= kMostFrames) throw Error("more than 100000 images");
+  // Nobody asks for the names again.
+  tagged.frame.header.frame_id.clear();
+  tagged.frame.scan.clear();
   tagged_.push_back(std::move(tagged));
   return true;
 }
@@ -442,6 +461,9 @@ void ScanServer::keep(const sensor_msgs::Image& image, Tagged* tagged) {
     throw Error("the images change their encoding on the way");
   }
   encoding_ = encoding;
+  const cv::Size size(static_cast<int>(image.width), static_cast<int>(image.height));
+  if (!size_.empty() && size != size_) throw Error("the images change their size on the way");
+  size_ = size;
   // As the sensor gave them where a recording can say so; else as they look.
   cv::Mat pixels;
   if (bayer || (encodings::isMono(image.encoding) && !swapped)) {

@@ -5,6 +5,8 @@
 
 #include <memory>
 
+#include "omnister/ros/logger_service.h"
+
 namespace omnister {
 
 /// The nodelet around what is made of the two node handles. Where that fails, loading fails, and
@@ -21,6 +23,7 @@ class ServerNodelet : public nodelet::Nodelet {
     }
   }
 
+  const std::shared_ptr<LoggerService> loggers_ = LoggerService::shared();
   std::unique_ptr<Server> server_;
 };
 

@@ -74,16 +74,19 @@ SimRig::SimRig(const ros::NodeHandle& private_node, const SimRigParameters& para
     : parameters_(parameters),
       board_(std::make_shared<std::atomic<int>>(-1)),
       stage_(std::make_shared<sim::SimulatedStage>(parameters.stage)) {
-  const sim::ScenePtr scene = sim::readScene(parameters.scene);
+  const auto read = [&private_node](const char* key, const auto& reader, const std::string& file) {
+    return fromFileOf(private_node, key, [&] { return reader(file); });
+  };
+  const sim::ScenePtr scene = read("scene", sim::readScene, parameters.scene);
   std::vector<sim::ScenePtr> with_board;
   if (!parameters.boards.empty()) {
-    const sim::ScenePtr boards = sim::readScene(parameters.boards);
+    const sim::ScenePtr boards = read("boards", sim::readScene, parameters.boards);
     for (std::size_t i = 0; i < boards->boards().size(); ++i) {
       with_board.push_back(sim::withBoard(*scene, *boards, i));
     }
     if (with_board.empty()) throw InputError(parameters.boards, "objects", "hold no board");
   }
-  const LensFile truth = readLensFile(parameters.lens);
+  const LensFile truth = read("lens", readLensFile, parameters.lens);
 
   if (parameters.controller == "grbl") {
     sim::GrblOptions options;

@@ -9,6 +9,7 @@
 #include <opencv2/core.hpp>
 
 #include "omnister/common/error.h"
+#include "omnister/common/numbers.h"
 #include "omnister/ros/conversions.h"
 #include "omnister/ros/parameters.h"
 #include "omnister/ros/stereo_messages.h"
@@ -23,14 +24,19 @@ SnapshotServer::SnapshotServer(const ros::NodeHandle& node, const ros::NodeHandl
   range_path_ = parameters.text("range", "range.tiff");
   timeout_ = parameters.number("timeout", timeout_, 0.1, 3600.0, "s");
   parameters.warnUnknown();
-  checkCloudPath(cloud_path_);
-  checkRangePath(range_path_);
+  parameters.file("cloud", cloud_path_, checkCloudPath);
+  parameters.file("range", range_path_, checkRangePath);
   ros::NodeHandle service_node = callbacks_.on(private_node);
   service_ = service_node.advertiseService("save", &SnapshotServer::onSave, this);
   callbacks_.start();
 }
 
 bool SnapshotServer::onSave(std_srvs::Trigger::Request&, std_srvs::Trigger::Response& response) {
+  if (busy_.exchange(true)) {
+    response.message = "another call waits for a cloud already";
+    response.success = false;
+    return true;
+  }
   try {
     response.message = save();
     response.success = true;
@@ -38,6 +44,7 @@ bool SnapshotServer::onSave(std_srvs::Trigger::Request&, std_srvs::Trigger::Resp
     response.message = printable(error.what(), 500);
     response.success = false;
   }
+  busy_ = false;
   return true;
 }
 
@@ -62,8 +69,7 @@ std::string SnapshotServer::save() const {
     queue.callOne(ros::WallDuration(0.05));
     if ((ros::SteadyTime::now() - start).toSec() > timeout_)
       throw Error("no cloud with a range image on " + points.getTopic() + " and " +
-                  ranges.getTopic() + " within " + std::to_string(static_cast<int>(timeout_)) +
-                  " s");
+                  ranges.getTopic() + " within " + formatNumber(timeout_) + " s");
   }
   if (!paired()) throw Error("the node goes down");
 

@@ -1,8 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "stereo_parameters.h"
 
+#include <ros/console.h>
+
 #include <algorithm>
 #include <tuple>
+#include <utility>
 
 #include "omnister/common/error.h"
 #include "omnister/common/image_file.h"
@@ -116,7 +119,7 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   result.rig_file = parameters.text("rig", "");
   result.fixed_frame = parameters.frame("fixed_frame", result.fixed_frame);
   result.mask = parameters.text("mask", "");
-  result.matching.mask = loadMask(result.mask);
+  result.matching.mask = parameters.file("mask", result.mask, loadMask);
 
   PairingOptions& pairing = result.pairing;
   pairing.min_baseline = parameters.number("min_baseline", 0.01, 1e-6, 1e3, "m");
@@ -156,6 +159,11 @@ StereoParameters loadStereoParameters(Parameters& parameters) {
   take(config, result);
   if (result.matching.max_range <= result.matching.min_range)
     throw InputError("~max_range", "", "is not larger than ~min_range");
+  for (const auto& [key, value] :
+       {std::pair("rig", &result.rig_file), std::pair("lens_displaced", &result.lens_displaced)}) {
+    if (!result.rig && !value->empty())
+      ROS_WARN("parameter ~%s is for mode rig and changes nothing", key);
+  }
   parameters.warnUnknown();
   return result;
 }

@@ -88,17 +88,23 @@ StereoPipeline::StereoPipeline(const ros::NodeHandle& node, const ros::NodeHandl
   const std::vector<std::string> prefixes =
       parameters_.rig ? std::vector<std::string>{"left/", "right/"} : std::vector<std::string>{""};
   std::string files[] = {parameters_.lens, parameters_.lens_displaced};
+  std::string keys[] = {"lens", "lens_displaced"};
   if (parameters_.rig && !parameters_.rig_file.empty()) {
-    const RigFile rig = readRigFile(parameters_.rig_file);
+    const RigFile rig =
+        fromFileOf(private_node, "rig", [this] { return readRigFile(parameters_.rig_file); });
     T_left_right_ = rig.T_ref_disp;
-    if (files[0].empty()) files[0] = rig.reference.string();
-    if (files[1].empty()) files[1] = rig.displaced.string();
+    const std::filesystem::path lenses[] = {rig.reference, rig.displaced};
+    for (std::size_t i = 0; i < 2; ++i) {
+      if (!files[i].empty()) continue;
+      files[i] = lenses[i].string();
+      keys[i] = "rig";
+    }
   }
   for (std::size_t i = 0; i < eyes_.size(); ++i) {
     eyes_[i].topic = node_.resolveName(prefixes[i] + "image_raw");
     const std::string& file = files[i];
     if (!file.empty()) {
-      eyes_[i].lens = readLensFile(file);
+      eyes_[i].lens = fromFileOf(private_node, keys[i], [&file] { return readLensFile(file); });
       eyes_[i].lens_from_file = true;
     }
   }

@@ -21,6 +21,7 @@ namespace enc = sensor_msgs::image_encodings;
 constexpr std::uint32_t kLensesWaiting = 16;  // in a shorter queue the one that counts may be lost
 constexpr double kWidestPinhole = 3.0;        // [rad]
 constexpr double kWarningPeriod = 5.0;        // [s]
+constexpr std::size_t kMostFrames = 16, kLongestFrame = 255;
 
 /// "camera_optical" -> "camera_view_optical".
 std::string viewFrame(const std::string& camera_frame) {
@@ -81,7 +82,9 @@ ViewServer::ViewServer(const ros::NodeHandle& node, const ros::NodeHandle& priva
       transport_(node_),
       config_(parameters_.view),
       diagnostics_(node, private_node, private_node.getNamespace()) {
-  if (!parameters_.lens.empty()) lens_ = readLensFile(parameters_.lens);
+  if (!parameters_.lens.empty()) {
+    lens_ = fromFileOf(private_node, "lens", [this] { return readLensFile(parameters_.lens); });
+  }
   config_server_ = std::make_unique<dynamic_reconfigure::Server<ViewConfig>>(
       config_mutex_, callbacks_.on(private_node));
   config_server_->setCallback([this](ViewConfig& config, std::uint32_t) { configure(config); });
@@ -210,6 +213,15 @@ ViewServer::Maps& ViewServer::maps() {
 const std::string& ViewServer::frameFor(const std::string& camera_frame) {
   const Eigen::Matrix3d rotation = viewRotation(config_.pan, config_.tilt, config_.roll);
   if (camera_frame != camera_frame_ || rotation != told_rotation_) {
+    // tf keeps every frame that it was ever told of.
+    if (camera_frame.size() > kLongestFrame)
+      throw Error("the name of the camera's frame is too long");
+    told_frames_.insert(camera_frame);
+    if (told_frames_.size() > kMostFrames) {
+      told_frames_.erase(camera_frame);
+      throw Error("images came with " + std::to_string(kMostFrames) +
+                  " other frames already: no further one is told to tf");
+    }
     camera_frame_ = camera_frame;
     view_frame_ = parameters_.frame_id.empty() ? viewFrame(camera_frame) : parameters_.frame_id;
     told_rotation_ = rotation;

@@ -50,7 +50,7 @@ void SerialCable::open() {
     const int reason = errno;
     ::close(device_end);
     if (kept_end >= 0) ::close(kept_end);
-    throw IoError("opening a pseudo terminal", "/dev/pts", reason);
+    throw IoError("open a pseudo terminal", "/dev/pts", reason);
   }
   // Bytes are bytes, also before somebody configures it.
   cfmakeraw(&settings);
@@ -65,7 +65,7 @@ void SerialCable::open() {
   std::filesystem::create_symlink(name, link_, error);
   if (error) {
     close();
-    throw IoError("making the link", link_.string(), error.value());
+    throw IoError("make the link", link_.string(), error.value());
   }
 }
 

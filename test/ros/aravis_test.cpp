@@ -304,6 +304,7 @@ TEST_F(AravisDriver, WhatIsNotKnownOfACameraIsNotWrittenToItsParameters) {
   EXPECT_EQ(number(config, "black_level"), 0.0);
   EXPECT_EQ(number(config, "exposure_us"), 5000.0);
   // With these the node starts again.
+  private_.setParam("device", parameters_.device);
   EXPECT_NO_THROW(loadCameraParameters(private_));
 }
 

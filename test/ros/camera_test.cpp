@@ -564,6 +564,14 @@ TEST_F(CameraTest, RefusesParametersByKeyValueAndRange) {
     private_.deleteParam(key);
     return message;
   };
+  for (const char* device : {"", "webcam", "magic:1", "replay:", "v4l2"}) {
+    EXPECT_THAT(refusal("device", device),
+                testing::AllOf(HasSubstr("device"), HasSubstr("aravis:SERIAL")));
+  }
+  private_.setParam("device", "replay:/there");
+  EXPECT_THAT(refusal("features", "GainAuto"), HasSubstr("Name=value"));
+  EXPECT_EQ(refusal("features", "GainAuto=Off"), "");
+  EXPECT_THAT(refusal("frame_id", std::string(256, 'f')), HasSubstr("255"));
   EXPECT_EQ(refusal("frame_rate", 25.0), "");
   EXPECT_EQ(refusal("frame_rate", 25), "");
   EXPECT_THAT(refusal("frame_rate", -1.0),

@@ -3,8 +3,10 @@
 """Every program that the package calls a node, together as a rig: what each offers, that the lazy ones are lazy, that
 services and parameters answer, that each comes back after it was killed and ends well when it is asked to."""
 import contextlib
+import itertools
 import re
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -19,8 +21,11 @@ import rospy
 import rostest
 from actionlib_msgs.msg import GoalID, GoalStatusArray
 from diagnostic_msgs.msg import DiagnosticArray
+from dynamic_reconfigure.srv import Reconfigure
 from geometry_msgs.msg import TransformStamped
+from roscpp.srv import GetLoggers
 from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
@@ -62,6 +67,11 @@ class Program:
         with stream:
             for line in stream:
                 self.output += line
+
+    def most_memory(self):
+        """Ever resident [MB]."""
+        status = Path('/proc/%d/status' % self.process.pid).read_text()
+        return int(re.search(r'^VmHWM:\s+(\d+) kB', status, re.M).group(1)) / 1024.0
 
     def end(self, sign, seconds=PATIENCE):
         """@return its exit code; None when it does not end"""
@@ -283,6 +293,67 @@ class EveryNode(unittest.TestCase):
         for publisher in publishers:
             publisher.unregister()
 
+    def test_4_the_log_of_every_node_can_be_asked_for(self):
+        """What rqt_logger_level does; Debian's own answer destroys the log, and the next line of it ends the node."""
+        for speaker in [program.name for program in self.programs.values()] + ['/manager']:
+            ask = rospy.ServiceProxy(speaker + '/get_loggers', GetLoggers)
+            for _ in range(3):
+                self.assertIn('ros', [logger.name for logger in ask().loggers], speaker)
+        for kind, program in self.programs.items():
+            self.assertIsNone(program.process.poll(), kind)
+
+    def test_4_arrays_longer_than_their_message_take_no_memory(self):
+        def lying(kind, before, count):
+            """Of that type by name and sum; its bytes end with the length of an array that does not come."""
+            def serialize(self, buffer):
+                buffer.write(before + struct.pack('<I', count))
+            return type(kind.__name__, (kind,), {'serialize': serialize})
+
+        header, goal_id = b'\0' * 16, b'\0' * 12
+        image = header + struct.pack('<II', 300, 400) + struct.pack('<I', 5) + b'mono8' + b'\0' + struct.pack('<I', 400)
+        # What is claimed would fill a gigabyte.
+        messages = [('/camera/image_raw', Image, image, 1 << 30), ('/tf', TFMessage, b'', 1 << 23),
+                    ('/tf_static', TFMessage, b'', 1 << 23),
+                    ('/stage/move_stage/status', GoalStatusArray, header, 1 << 24),
+                    ('/camera/scan/goal', self.rig.msg.ScanActionGoal, header + goal_id, (1 << 29) + 1)]
+        calls = [('/camera/view_node/set_parameters', Reconfigure, b'', 1 << 24),
+                 ('/camera/stereo/set_parameters', Reconfigure, b'', 1 << 24),
+                 ('/camera/set_camera_info', SetCameraInfo, header + b'\0' * 12, 1 << 27)]
+        before = {kind: program.most_memory() for kind, program in self.programs.items()}
+        with self.listener('/camera/view/image_raw', Image), self.listener('/camera/points2', PointCloud2):
+            for node in ('/camera/view_node', '/camera/stereo'):
+                self.assertTrue(eventually(lambda: Graph().hears(node, '/camera/image_raw')), node)
+            for topic, kind, body, count in messages:
+                publisher = rospy.Publisher(topic, lying(kind, body, count), queue_size=1)
+                heard = Graph().heard[topic]
+                self.assertTrue(eventually(lambda: publisher.get_num_connections() >= len(heard)), topic)
+                publisher.publish(publisher.data_class())
+                # That it was taken in, by word of who is asked next on the same connection or thread.
+                rospy.sleep(0.2)
+                publisher.unregister()
+            for service, kind, body, count in calls:
+                class Lying(kind):
+                    _request_class = lying(kind._request_class, body, count)
+                with self.assertRaises(rospy.ServiceException):
+                    rospy.ServiceProxy(service, Lying)(Lying._request_class())
+        self.a_cloud()
+        for kind, program in self.programs.items():
+            self.assertIsNone(program.process.poll(), kind)
+            self.assertLess(program.most_memory() - before[kind], 500.0, kind)
+
+    def test_5_files_that_parameters_name_are_refused_by_the_parameters_name(self):
+        refused = 0
+        for kind, key, value in (('camera_node', 'lens', '/no/lens.yaml'), ('camera_node', 'device', 'webcam'),
+                                 ('stereo_node', 'mask', '/no/mask.png'), ('stereo_node', 'lens', '/dev/null'),
+                                 ('view_node', 'lens', '/no/lens.yaml'), ('calibration_node', 'target', '/no/board.yaml'),
+                                 ('sim_rig_node', 'scene', '/no/scene.yaml'), ('snapshot_node', 'cloud', 'cloud.txt')):
+            beside = Program('/refused/%s_%s' % (kind, key), [], arguments=self.programs[kind].arguments)
+            beside.start(kind, '_%s:=%s' % (key, value))
+            self.assertEqual(beside.wait(), 1, kind)
+            self.assertIn('parameter %s/%s: ' % (beside.name, key), beside.output.decode())
+            refused += 1
+        self.assertEqual(refused, 8)
+
     def test_5_a_wrong_parameter_is_refused_by_name(self):
         refused = 0
         for kind, program in self.programs.items():
@@ -311,8 +382,10 @@ class EveryNode(unittest.TestCase):
 
     def test_7_each_ends_when_it_is_asked_to(self):
         ended = 0
-        for kind, program in reversed(list(self.programs.items())):
-            code = program.end(signal.SIGINT)
+        # The second is what systemd sends, the third comes of a terminal that is closed.
+        signs = itertools.cycle((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
+        for sign, (kind, program) in zip(signs, reversed(list(self.programs.items()))):
+            code = program.end(sign)
             self.assertEqual(code, 0, '%s: %s' % (kind, program.output.decode()[-2000:]))
             self.assertTrue(eventually(lambda: len(self.missing(kind)) == len(program.offers)), kind)
             ended += 1

@@ -64,7 +64,7 @@ TEST(ScanGoal, BecomesStopsOrASweep) {
   goal.step = 0.0;
   EXPECT_TRUE(stopsOf(goal).empty());
   int refused = 0;
-  for (int i = 0; i < 6; ++i) {
+  for (int i = 0; i < 7; ++i) {
     ScanGoal bad;
     bad.stop = 0.3;
     if (i == 0) bad.stop = 0.0;
@@ -73,10 +73,11 @@ TEST(ScanGoal, BecomesStopsOrASweep) {
     if (i == 3) bad.speed = -1.0;
     if (i == 4) bad.positions = {0.1, INFINITY};
     if (i == 5) bad.step = 1e-9;
+    if (i == 6) bad.frames = 4294967295u;
     EXPECT_THROW(stopsOf(bad), InputError) << i;
     ++refused;
   }
-  EXPECT_EQ(refused, 6);
+  EXPECT_EQ(refused, 7);
 }
 
 class Scan : public testing::Test {
@@ -183,6 +184,17 @@ TEST_F(Scan, SweepsTagImagesInMotion) {
   goal.stop = 0.25;
   goal.speed = 0.06;
   goal.folder = (folder_.path() / "sweep").string();
+  // Somebody says of the stage what cannot be.
+  ros::Publisher liar = node_.advertise<StageState>("stage/stage_state", 10);
+  int lies = 0;
+  const ros::WallTimer lying =
+      node_.createWallTimer(ros::WallDuration(0.02), [&](const ros::WallTimerEvent&) {
+        StageState lie;
+        lie.header.stamp = ros::Time::now();
+        lie.position = ++lies % 2 == 0 ? std::nan("") : 1e300;
+        lie.homed = true;
+        liar.publish(lie);
+      });
   ASSERT_EQ(run(goal), SimpleClientGoalState::SUCCEEDED) << client_.getResult()->message;
   const device::Recording recording = device::readRecording(goal.folder);
   ASSERT_GE(recording.frames.size(), 3u);
@@ -199,6 +211,7 @@ TEST_F(Scan, SweepsTagImagesInMotion) {
     }
   }
   EXPECT_GE(moving, 2);
+  EXPECT_GE(lies, 20);
 }
 
 /// With images that are large enough to be matched.

@@ -7,6 +7,8 @@
 #include <cmath>
 #include <limits>
 #include <opencv2/imgproc.hpp>
+#include <set>
+#include <string>
 
 #include "omnister/lens/lens_models.h"
 #include "omnister/ros/conversions.h"
@@ -277,6 +279,37 @@ TEST_F(ViewNode, GoesOnAfterBadMessages) {
     return views.size() > 0;
   }));
   EXPECT_EQ(depths.size(), 0u);
+}
+
+TEST_F(ViewNode, TellsTfOfFewFramesHoweverManyImagesName) {
+  start();
+  Collector<sensor_msgs::Image> views(node_, "view/image_raw");
+  ASSERT_TRUE(eventually([&] { return images_.getNumSubscribers() > 0; }));
+  const cv::Mat picture = pictureOf({0.5, 0, 1});
+  std::set<std::string> seen;
+  int named = 0;
+  const auto show = [&] {
+    const sensor_msgs::ImagePtr image = toImage(picture, "mono8");
+    image->header.stamp = ros::Time::now();
+    image->header.frame_id = "stranger_" + std::to_string(named++ % 40);
+    images_.publish(image);
+    ros::WallDuration(0.02).sleep();
+    for (const auto& view : views.messages()) seen.insert(view->header.frame_id);
+    views.clear();
+  };
+  // The lens' own frame is the sixteenth.
+  ASSERT_TRUE(eventually([&] {
+    show();
+    return seen.size() >= 15;
+  }));
+  for (int i = 0; i < 80; ++i) show();
+  EXPECT_EQ(seen.size(), 15u);
+  EXPECT_TRUE(eventually([&] {
+    publish(images_, toImage(picture, "mono8"));
+    ros::WallDuration(0.02).sleep();
+    const auto last = views.last();
+    return last && last->header.frame_id.find("stranger") == std::string::npos;
+  }));
 }
 
 }  // namespace

@@ -148,6 +148,9 @@ class Camera {
   virtual std::optional<std::filesystem::path> lensFile() const { return std::nullopt; }
 };
 
+/// @throws InputError for a text that names no backend, whatever is plugged in
+void checkCameraDevice(const std::string& device);
+
 /// @param device `aravis:WHICH` (see aravis_camera.h), `v4l2:WHICH` (see v4l2_camera.h),
 /// `replay:PATH` (see replay_camera.h)
 /// @throws CameraError; InputError for a text that names no backend or a broken recording

@@ -15,6 +15,16 @@
 
 namespace omnister {
 
+/// What `read` makes of a file that a parameter names. What goes wrong names the parameter, too.
+template <typename Read>
+auto fromFileOf(const ros::NodeHandle& private_node, const std::string& key, const Read& read) {
+  try {
+    return read();
+  } catch (const std::exception& error) {
+    throw InputError("parameter " + private_node.resolveName(key), "", error.what());
+  }
+}
+
 /// Getters throw InputError("~key", …). A parameter that is not set takes its default.
 class Parameters {
  public:
@@ -40,6 +50,12 @@ class Parameters {
   /// A tf frame name: not empty unless the default is, no leading slash.
   std::string frame(const std::string& key, const std::string& fallback);
   std::vector<std::string> texts(const std::string& key);
+
+  /// The same for a parameter of this node. @param read gets the path
+  template <typename Read>
+  auto file(const std::string& key, const std::string& path, const Read& read) const {
+    return fromFileOf(node_, key, [&] { return read(path); });
+  }
 
   /// A key that others read.
   void ignore(const std::string& key) { known_.insert(key); }

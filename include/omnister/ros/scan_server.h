@@ -71,6 +71,15 @@ class ScanServer {
   /// The goal was cancelled or replaced, or the node goes down.
   struct Preempted {};
 
+  /// What is kept of a stage_state: no more than it can be asked for.
+  struct Reading {
+    ros::Time stamp;
+    double position = 0.0;
+    double velocity = 0.0;
+    bool moving = false;
+    bool homed = false;
+    bool faulty = false;
+  };
   struct Waiting {
     sensor_msgs::ImageConstPtr image;
     ros::SteadyTime since;
@@ -115,7 +124,7 @@ class ScanServer {
   std::mutex mutex_;  ///< all below
   std::condition_variable wake_;
   bool stopping_ = false;
-  std::deque<StageState> readings_;  ///< oldest first, each with a stamp of its own
+  std::deque<Reading> readings_;  ///< oldest first, each with a stamp of its own
   std::deque<Waiting> waiting_;
   std::size_t dropped_ = 0;
 
@@ -130,6 +139,7 @@ class ScanServer {
   std::uint32_t settled_here_ = 0;
   std::vector<Tagged> tagged_;
   cv::Mat last_gray_;
+  cv::Size size_;  ///< of the images that are kept
   std::string last_obstacle_;
 
   std::unique_ptr<Mover> mover_;

@@ -5,6 +5,7 @@
 #include <ros/ros.h>
 #include <std_srvs/Trigger.h>
 
+#include <atomic>
 #include <filesystem>
 #include <string>
 
@@ -15,8 +16,8 @@ namespace omnister {
 /// Service `~save` (std_srvs/Trigger): waits for the next cloud on `points2` and the range image on
 /// `range` of the same stamp, and writes both to the files that the parameters `~cloud` (.ply or
 /// .pcd) and `~range`
-/// (.tiff) name: both or none. Paths come from parameters only, never from a message. Subscribes
-/// only while it waits.
+/// (.tiff) name: both or none. A second call meanwhile is refused. Paths come from parameters only,
+/// never from a message. Subscribes only while it waits.
 class SnapshotServer {
  public:
   /// @throws Error for parameters that do not hold
@@ -29,11 +30,12 @@ class SnapshotServer {
   bool onSave(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   std::string save() const;
 
-  CallbackThreads callbacks_;  // before all that uses it
+  CallbackThreads callbacks_{2};  // before all that uses it; one waits, the other refuses
   ros::NodeHandle node_;
   std::filesystem::path cloud_path_;
   std::filesystem::path range_path_;
   double timeout_ = 30.0;  ///< until a cloud comes [s]
+  std::atomic<bool> busy_{false};
   ros::ServiceServer service_;
 };
 

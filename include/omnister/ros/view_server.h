@@ -12,6 +12,7 @@
 #include <memory>
 #include <mutex>
 #include <optional>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -102,6 +103,7 @@ class ViewServer {
   Tally ranges_;
   std::string problem_;  ///< with the last message; empty when there is none
   std::string camera_frame_;
+  std::set<std::string> told_frames_;  ///< of cameras, to tf
   std::string view_frame_;
   Eigen::Matrix3d told_rotation_ = Eigen::Matrix3d::Zero();  ///< of the last static tf
   std::shared_ptr<StaticFrames> static_frames_ = StaticFrames::shared();
