@@ -165,6 +165,7 @@ std::optional<std::vector<cv::Point2f>> orderGrid(const std::vector<cv::Point2f>
       best_square = square;
     }
   }
+  if (best == nullptr) return std::nullopt;
   return best->points;
 }
 
