@@ -93,8 +93,8 @@ const Eigen::Matrix<double, 6, 9>& quadraticFit() {
   static const Eigen::Matrix<double, 6, 9> fit = [] {
     Eigen::Matrix<double, 9, 6> A;
     for (int k = 0; k < 9; ++k) {
-      const double x = kHalf * (k % 3 - 1);
-      const double y = kHalf * (k / 3 - 1);
+      const int column = k % 3 - 1, row = k / 3 - 1;
+      const double x = kHalf * column, y = kHalf * row;
       A.row(k) << 1.0, x, y, x * x, x * y, y * y;
     }
     return Eigen::Matrix<double, 6, 9>((A.transpose() * A).ldlt().solve(A.transpose()));
@@ -187,8 +187,8 @@ class Aligner {
 
     Window window;
     for (int k = 0; k < 9; ++k) {
-      const auto ray =
-          scene_.lens->unproject({cx + kHalf * (k % 3 - 1.0), cy + kHalf * (k / 3 - 1.0)});
+      const int column = k % 3 - 1, row = k / 3 - 1;
+      const auto ray = scene_.lens->unproject({cx + kHalf * column, cy + kHalf * row});
       if (!ray) return result;
       window.rays[k] = *ray;
     }

@@ -289,7 +289,8 @@ bool fitSide(const cv::Mat& fine, double begin, double end, double half, Side& s
   // The corners themselves are rounded by the lens.
   const double inset = std::max(2.0, 0.06 * length);
   std::vector<Eigen::Vector2d> places;
-  for (double s = begin + inset; s <= end - inset; s += 1.0) {
+  for (int i = 0; begin + inset + i <= end - inset; ++i) {
+    const double s = begin + inset + i;
     const double here = side.bend(0) + side.bend(1) * s + side.bend(2) * s * s;
     double weight = 0.0;
     double moment = 0.0;

@@ -227,7 +227,7 @@ std::map<std::string, std::string> nonsense() {
           {"a byte order mark", "\xEF\xBB\xBF"},
           {"UTF-16", std::string("\xFF\xFEl\0e\0n\0s\0:\0 \0"
                                  "1\0",
-                                 18)},
+                                 16)},
           {"broken UTF-8", "lens: \xC3\x28\xFF\n"},
           {"control characters", "lens: \x1b[31mred\x07\n"},
           {"words", "this is not the file you are looking for\n"},
