@@ -312,7 +312,8 @@ std::vector<Eigen::Vector3d> targetPoints(const Target& target) {
     for (int col = 0; col < grid.x(); ++col) {
       if (target.type == TargetType::kAprilGrid) {
         const double pitch = 1.0 + target.spacing;
-        points.emplace_back(side * (col / 2 * pitch + col % 2), side * (row / 2 * pitch + row % 2),
+        const int across = col / 2, down = row / 2;  // tags, of two corners a side
+        points.emplace_back(side * (across * pitch + col % 2), side * (down * pitch + row % 2),
                             0.0);
       } else if (target.asymmetric) {
         points.emplace_back(side * (2 * col + row % 2), side * row, 0.0);

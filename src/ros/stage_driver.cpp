@@ -98,8 +98,8 @@ StageDriver::StageDriver(const ros::NodeHandle& node, const ros::NodeHandle& pri
       diagnostics_(node, private_node, private_node.getNamespace()),
       pace_(parameters_.diagnostic_period_s),
       server_(
-          node_, "move_stage", [this](Server::GoalHandle handle) { onGoal(std::move(handle)); },
-          [this](Server::GoalHandle handle) { onCancel(std::move(handle)); }, false) {
+          node_, "move_stage", [this](const Server::GoalHandle& handle) { onGoal(handle); },
+          [this](const Server::GoalHandle& handle) { onCancel(handle); }, false) {
   const bool echo =
       parameters_.device == "external" && parameters_.external.frame_id.empty() &&
       node_.resolveName(parameters_.external.topic) == node_.resolveName("joint_states");
@@ -430,7 +430,7 @@ void StageDriver::onGoal(Server::GoalHandle handle) {
     finishLocked(Outcome::kCanceled, "replaced by a new goal");
     handle.setAccepted();
     goal_ = Goal();
-    goal_->handle = std::move(handle);
+    goal_->handle = handle;
     goal_->target_m = target;
     goal_->reference = reading_.reference;
     beganLocked();

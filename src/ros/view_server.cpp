@@ -202,7 +202,7 @@ ViewServer::Maps& ViewServer::maps() {
     throw Error("no lens yet: nothing on " + node_.resolveName("lens_model") +
                 ", and no parameter ~lens");
   if (!maps_) {
-    maps_.emplace();
+    maps_ = Maps();
     maps_->geometry = geometryOf(config_);
     maps_->lens = *lens_;
     maps_->anti_alias = config_.anti_alias;

@@ -303,7 +303,8 @@ PointMaker::PointMaker(const LensModel& lens, cv::Size size, int threads)
   parallelFor(0, edge.size(), threads, [&](std::size_t k) {
     const int u0 = edge[k] % cells_.width * kCell, v0 = edge[k] / cells_.width * kCell;
     for (int i = 0; i < kCell * kCell; ++i) {
-      exact_[k * kCell * kCell + i] = rayOf(lens, u0 + i % kCell, v0 + i / kCell);
+      const int u = u0 + i % kCell, v = v0 + i / kCell;
+      exact_[k * kCell * kCell + i] = rayOf(lens, u, v);
     }
   });
 }

@@ -86,7 +86,7 @@ int DriftMonitor::add(double time, const StereoGeometry& geometry, const cv::Mat
   displaced_lens_ = other.lens;
 
   // As many corners from every part, so that no part speaks for the others.
-  const cv::Mat matched = range == range;  // not NaN
+  const cv::Mat matched = range > 0.0;  // not NaN
   const int parts = options_.columns * options_.rows;
   std::vector<cv::Point2f> corners;
   std::vector<int> part_of;

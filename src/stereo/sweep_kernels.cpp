@@ -235,7 +235,10 @@ void CensusRow(const std::uint8_t* const rows[5], int count, std::uint8_t* const
     }
     for (; x < count; ++x) {
       unsigned bits = 0;
-      for (int i = 0; i < 8; ++i) bits |= (neighbour[i][x] > centre[x] ? 1u : 0u) << i;
+      for (int i = 0; i < 8; ++i) {
+        const unsigned more = neighbour[i][x] > centre[x] ? 1 : 0;
+        bits |= more << i;
+      }
       to[x] = static_cast<std::uint8_t>(centre[x] == 0 ? 0 : bits);
     }
   }
