@@ -11,10 +11,10 @@ void checkCameraDevice(const std::string& device) {
   const std::string backend = device.substr(0, colon);
   if (colon != std::string::npos && (backend == "aravis" || backend == "v4l2")) return;
   if (backend == "replay" && device.size() > colon + 1 && colon != std::string::npos) return;
-  throw InputError("device", "",
-                   "is \"" + printable(device) +
-                       "\", expected aravis:SERIAL (GigE or USB3 Vision), v4l2:/dev/videoN or "
-                       "replay:DIR (recorded images)");
+  throw InputError(
+      "\"" + printable(device) + "\"", "",
+      "is no camera, expected aravis:SERIAL (GigE or USB3 Vision), v4l2:/dev/videoN or "
+      "replay:DIR (recorded images)");
 }
 
 std::unique_ptr<Camera> openCamera(const std::string& device, const CameraSettings& settings) {

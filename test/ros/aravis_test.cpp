@@ -238,7 +238,8 @@ TEST_F(AravisDriver, DiagnosticsTellOfTheLink) {
 
 TEST_F(AravisDriver, ANodeThatCannotStartSaysWhy) {
   ros::NodeHandle().setParam("bad_camera/frame_rate", -1.0);
-  const std::unique_ptr<test::ChildProcess> node = startNode({"__name:=bad_camera"});
+  const std::unique_ptr<test::ChildProcess> node =
+      startNode({"__name:=bad_camera", "_device:=aravis:nobody"});
   EXPECT_EQ(node->wait(), 1);
   EXPECT_THAT(said(), testing::AllOf(HasSubstr("/bad_camera/frame_rate"), HasSubstr("-1")));
 }
