@@ -10,11 +10,14 @@
 
 #include <algorithm>
 #include <chrono>
+#include <cmath>
+#include <cstring>
 #include <optional>
 #include <set>
 #include <utility>
 #include <vector>
 
+#include "bag_check.h"
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
 #include "omnister/ros/conversions.h"
@@ -33,6 +36,63 @@ WorkerSettings settingsOf(const BagRunOptions& options) {
   settings.matcher = options.matcher;
   settings.matching = options.matching;
   return settings;
+}
+
+/// Steps over the fields of a serialized message. roscpp makes room for what a length claims before
+/// it looks whether there is so much.
+class Fields {
+ public:
+  Fields(const std::uint8_t* bytes, std::size_t size) : at_(bytes), left_(size) {}
+
+  bool skip(std::uint64_t count) {
+    if (count > left_) return false;
+    at_ += count;
+    left_ -= count;
+    return true;
+  }
+  bool length(std::uint32_t& count) {
+    if (left_ < sizeof count) return false;
+    std::memcpy(&count, at_, sizeof count);
+    return skip(sizeof count);
+  }
+  /// As many things of `size` bytes as a length says.
+  bool list(std::size_t size) {
+    std::uint32_t count = 0;
+    return length(count) && skip(std::uint64_t{count} * size);
+  }
+  bool text() { return list(1); }
+  bool header() { return skip(12) && text(); }
+
+ private:
+  const std::uint8_t* at_;
+  std::size_t left_;
+};
+
+/// Whether all that a message's lengths claim is there.
+template <typename Message>
+bool isWhole(Fields fields);
+
+template <>
+bool isWhole<sensor_msgs::Image>(Fields fields) {
+  return fields.header() && fields.skip(8) && fields.text() && fields.skip(5) && fields.list(1);
+}
+
+template <>
+bool isWhole<tf2_msgs::TFMessage>(Fields fields) {
+  std::uint32_t count = 0;
+  bool whole = fields.length(count);
+  for (; whole && count > 0; --count)
+    whole = fields.header() && fields.text() && fields.skip(7 * sizeof(double));
+  return whole;
+}
+
+template <>
+bool isWhole<LensModelMessage>(Fields fields) {
+  std::uint32_t names = 0;
+  bool whole = fields.header() && fields.skip(8) && fields.text() &&
+               fields.skip(3 * sizeof(double)) && fields.length(names);
+  for (; whole && names > 0; --names) whole = fields.text();
+  return whole && fields.list(sizeof(double)) && fields.skip(2 * sizeof(double)) && fields.text();
 }
 
 class BagRun {
@@ -60,16 +120,16 @@ class BagRun {
   }
 
  private:
+  using Policy =
+      message_filters::sync_policies::ApproximateTime<sensor_msgs::Image, sensor_msgs::Image>;
+
   void open(const std::filesystem::path& path) {
-    if (!std::filesystem::is_regular_file(path))
-      throw InputError(source_, "", "is not a file, expected a bag");
+    const BagFacts facts = checkBag(path);
+    if (facts.untimed > 0) summary_.dropped["message recorded at time 0"] = facts.untimed;
     try {
       bag_.open(source_, rosbag::bagmode::Read);
     } catch (const std::exception& error) {
-      // A recording that was cut off ends without its index.
-      throw InputError(source_, "",
-                       "is not a whole bag: " + printable(error.what()) +
-                           " (rosbag reindex mends one that was cut off)");
+      throw InputError(source_, "", "is not a whole bag: " + printable(error.what()));
     }
   }
 
@@ -111,15 +171,33 @@ class BagRun {
       if (!files[i].empty()) lenses_[i] = readLensFile(files[i]);
   }
 
+  /// Nothing where the message is not what it should be, and of what kind it is then.
+  template <typename Message>
+  static boost::shared_ptr<const Message> read(const rosbag::MessageInstance& instance,
+                                               std::string* problem) {
+    *problem = "message of another type on " + instance.getTopic();
+    if (!instance.isType<Message>()) return nullptr;
+    *problem = "broken message on " + instance.getTopic();
+    try {
+      std::vector<std::uint8_t> bytes(instance.size());
+      ros::serialization::OStream to(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
+      instance.write(to);
+      if (!isWhole<Message>({bytes.data(), bytes.size()})) return nullptr;
+      const auto message = boost::make_shared<Message>();
+      ros::serialization::IStream from(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
+      ros::serialization::deserialize(from, *message);
+      return message;
+    } catch (const std::exception& error) {
+      return nullptr;
+    }
+  }
+
   template <typename Message>
   boost::shared_ptr<const Message> instantiate(const rosbag::MessageInstance& instance) {
-    try {
-      if (auto message = instance.instantiate<Message>()) return message;
-      drop("message of another type on " + instance.getTopic());
-    } catch (const std::exception& error) {
-      drop("broken message on " + instance.getTopic());
-    }
-    return nullptr;
+    std::string problem;
+    auto message = read<Message>(instance, &problem);
+    if (!message) drop(problem);
+    return message;
   }
 
   void drop(const std::string& reason) { ++summary_.dropped[printable(reason, 300)]; }
@@ -141,7 +219,30 @@ class BagRun {
     }
   }
 
+  /// Whether a stamp can be of this recording. One that is decades off would push all others out of
+  /// tf, and differences of stamps with it are no durations for ROS.
+  bool isNear(const ros::Time& stamp) const {
+    constexpr double kFarthest = 9e8;  // [s]
+    return canReckonWith(stamp) &&
+           (!middle_stamp_ || std::abs(stamp.toSec() - *middle_stamp_) < kFarthest);
+  }
+
+  void findMiddleStamp() {
+    std::vector<double> stamps;
+    forEach({"/tf", "tf"}, "reading poses", 0.0, 0.02, [&](const rosbag::MessageInstance& one) {
+      std::string unused;
+      if (const auto message = read<tf2_msgs::TFMessage>(one, &unused))
+        for (const auto& transform : message->transforms)
+          stamps.push_back(transform.header.stamp.toSec());
+    });
+    if (stamps.empty()) return;
+    const auto middle = stamps.begin() + static_cast<std::ptrdiff_t>(stamps.size() / 2);
+    std::nth_element(stamps.begin(), middle, stamps.end());
+    middle_stamp_ = *middle;
+  }
+
   void readPosesAndLensTopics() {
+    findMiddleStamp();
     std::vector<std::string> topics = {"/tf", "/tf_static", "tf", "tf_static"};
     std::map<std::string, std::size_t> eye_of_topic;
     std::vector<ros::Time> stamps(lenses_.size());
@@ -150,14 +251,13 @@ class BagRun {
       eye_of_topic[namespaceOf(topics_[i]) + "lens_model"] = i;
       topics.push_back(namespaceOf(topics_[i]) + "lens_model");
     }
-    forEach(topics, "reading poses", 0.0, 0.05, [&](const rosbag::MessageInstance& instance) {
+    forEach(topics, "reading poses", 0.02, 0.05, [&](const rosbag::MessageInstance& instance) {
       const auto eye = eye_of_topic.find(instance.getTopic());
       if (eye == eye_of_topic.end()) {
         const auto message = instantiate<tf2_msgs::TFMessage>(instance);
         if (!message) return;
         const bool fixed = instance.getTopic().find("tf_static") != std::string::npos;
-        for (const auto& transform : message->transforms)
-          if (!tf_->setTransform(transform, "bag", fixed)) drop("transform that tf refuses");
+        for (const auto& transform : message->transforms) addTransform(transform, fixed);
         return;
       }
       const auto message = instantiate<LensModelMessage>(instance);
@@ -176,15 +276,21 @@ class BagRun {
                          "holds no lens: give a lens file (--lens)");
   }
 
+  void addTransform(const geometry_msgs::TransformStamped& transform, bool fixed) {
+    // What is fixed holds at all times.
+    bool taken = fixed ? canReckonWith(transform.header.stamp) : isNear(transform.header.stamp);
+    try {
+      taken = taken && tf_->setTransform(transform, "bag", fixed);
+    } catch (const std::exception&) {
+      taken = false;
+    }
+    if (!taken) drop("transform that tf refuses");
+  }
+
   void readImages() {
-    using Policy =
-        message_filters::sync_policies::ApproximateTime<sensor_msgs::Image, sensor_msgs::Image>;
-    Policy policy(8);
-    policy.setMaxIntervalDuration(ros::Duration(options_.max_skew));
-    message_filters::Synchronizer<Policy> synchronizer(static_cast<const Policy&>(policy));
-    synchronizer.registerCallback(
-        boost::bind(&BagRun::matchRig, this, boost::placeholders::_1, boost::placeholders::_2));
     std::optional<std::pair<double, double>> span;
+    std::size_t good = 0;
+    if (options_.rig) beginPairs();
     forEach(topics_, "matching", 0.05, 1.0, [&](const rosbag::MessageInstance& instance) {
       const sensor_msgs::ImageConstPtr image = instantiate<sensor_msgs::Image>(instance);
       if (!image) return;
@@ -192,21 +298,58 @@ class BagRun {
       const std::size_t eye = instance.getTopic() == topics_[0] ? 0 : 1;
       try {
         checkFrame(*image, lenses_[eye]->image_size, instance.getTopic());
+        if (!isNear(image->header.stamp))
+          throw InputError(instance.getTopic(), "header.stamp", "is decades off the others");
       } catch (const Error& error) {
         return drop(error.what());
       }
+      ++good;
       const double stamp = image->header.stamp.toSec();
+      if (!middle_stamp_) middle_stamp_ = stamp;
       span = span ? std::make_pair(std::min(span->first, stamp), std::max(span->second, stamp))
                   : std::make_pair(stamp, stamp);
-      const ros::MessageEvent<const sensor_msgs::Image> event(image, instance.getTime());
-      if (!options_.rig)
-        matchStage(image);
-      else if (eye == 0)
-        synchronizer.add<0>(event);
+      if (options_.rig)
+        addToPairs(image, eye);
       else
-        synchronizer.add<1>(event);
+        matchStage(image);
     });
-    if (span) summary_.recorded_seconds = span->second - span->first;
+    if (!span) return;
+    summary_.recorded_seconds = span->second - span->first;
+    if (!options_.rig) return;
+    endPairs(span->second);
+    const std::size_t alone = good - std::min(good, 2 * summary_.sets);
+    if (alone > 0) summary_.dropped["image without one of the other camera"] = alone;
+  }
+
+  void beginPairs() {
+    Policy policy(8);
+    policy.setMaxIntervalDuration(ros::Duration(options_.max_skew));
+    synchronizer_ =
+        std::make_unique<message_filters::Synchronizer<Policy>>(static_cast<const Policy&>(policy));
+    synchronizer_->registerCallback(
+        boost::bind(&BagRun::keepPair, this, boost::placeholders::_1, boost::placeholders::_2));
+  }
+
+  void keepPair(const sensor_msgs::ImageConstPtr& left, const sensor_msgs::ImageConstPtr& right) {
+    if (!left->data.empty() && !right->data.empty()) pairs_.emplace_back(left, right);
+  }
+
+  void addToPairs(const sensor_msgs::ImageConstPtr& image, std::size_t eye) {
+    const ros::MessageEvent<const sensor_msgs::Image> event(image, image->header.stamp);
+    if (eye == 0)
+      synchronizer_->add<0>(event);
+    else
+      synchronizer_->add<1>(event);
+    for (const auto& [left, right] : std::exchange(pairs_, {})) matchRig(left, right);
+  }
+
+  /// A pair goes out when what comes later shows that nothing fits better: so comes what has no
+  /// picture.
+  void endPairs(double newest) {
+    const auto end = boost::make_shared<sensor_msgs::Image>();
+    end->header.stamp.fromSec(newest + 10.0);
+    addToPairs(end, 0);
+    addToPairs(end, 1);
   }
 
   PoseAnswer cameraPose(const std::string& frame_id, std::int64_t stamp_ns) const {
@@ -290,7 +433,10 @@ class BagRun {
   std::vector<std::optional<LensFile>> lenses_;  ///< by topic
   std::optional<Pose> T_left_right_;
   std::unique_ptr<tf2::BufferCore> tf_;
+  std::optional<double> middle_stamp_;  ///< of all of tf; without tf, of the first image [s]
   FramePairing pairing_;
+  std::unique_ptr<message_filters::Synchronizer<Policy>> synchronizer_;  ///< of a rig
+  std::vector<std::pair<sensor_msgs::ImageConstPtr, sensor_msgs::ImageConstPtr>> pairs_;
   StereoWorker worker_;
   BagRunSummary summary_;
 };

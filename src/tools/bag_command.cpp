@@ -203,6 +203,14 @@ class RunFolder {
   bool begun_ = false;  ///< the folder was not there before
 };
 
+[[noreturn]] void refuseWithoutImages(const std::string& bag, const BagRunSummary& summary) {
+  std::string reasons;
+  for (const auto& [reason, count] : summary.dropped)
+    reasons += (reasons.empty() ? " (" : ", ") + std::to_string(count) + " times: " + reason;
+  throw InputError(bag, "",
+                   "holds no image that can be used" + (reasons.empty() ? "" : reasons + ")"));
+}
+
 void runBagCommand(BagArguments& arguments, bool json) {
   // What it says of a damaged bag comes before our message, which says the same.
   console_bridge::noOutputHandler();
@@ -223,6 +231,7 @@ void runBagCommand(BagArguments& arguments, bool json) {
           ++clouds;
         },
         consoleProgress());
+    if (summary.images == 0) refuseWithoutImages(arguments.bag, summary);
   } catch (const Error&) {
     if (clouds == 0) folder.removeIfBegun();
     throw;
@@ -244,7 +253,6 @@ void runBagCommand(BagArguments& arguments, bool json) {
       {"recorded_seconds", summary.recorded_seconds},
       {"seconds", seconds}};
   printResult(json, result);
-  if (summary.images == 0) throw InputError(arguments.bag, "", "holds no image that can be used");
 }
 
 }  // namespace

@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "omnister/common/error.h"
 #include "omnister/common/progress.h"
 
 namespace omnister::tools {
@@ -41,6 +42,20 @@ struct Size {
   int height = 0;
 };
 bool lexical_cast(const std::string& text, Size& size);
+
+/// What `work` gives. An error that names no file names `source`, which it is about.
+template <typename Work>
+auto namingSource(const std::string& source, const Work& work) {
+  try {
+    return work();
+  } catch (const InputError&) {
+    throw;
+  } catch (const IoError&) {
+    throw;
+  } catch (const Error& error) {
+    throw InputError(source, "", error.what());
+  }
+}
 
 /// Every subcommand has one of these, in the file of its name.
 using AddCommand = void (*)(CLI::App& app);

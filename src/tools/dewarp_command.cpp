@@ -46,7 +46,7 @@ void run(const Arguments& arguments, bool json) {
   const auto start = std::chrono::steady_clock::now();
   const View view(*lens.lens, lens.image_size, geometry, !arguments.plain);
   const auto made = std::chrono::steady_clock::now();
-  const cv::Mat result = view.render(image);
+  const cv::Mat result = namingSource(arguments.in, [&] { return view.render(image); });
   const auto done = std::chrono::steady_clock::now();
   writeImage(arguments.out, result);
 

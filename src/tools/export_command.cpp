@@ -52,7 +52,9 @@ void run(const Options& options, bool json) {
     }
   }
   if (options.narrow || !failure.empty()) {
-    const auto widest = exportWidest(file, options.format, options.model, options.max_residual_px);
+    const auto widest = namingSource(options.lens, [&] {
+      return exportWidest(file, options.format, options.model, options.max_residual_px);
+    });
     if (options.narrow && widest) {
       made = *widest;
       const double whole = file.lens->maxTheta();

@@ -71,7 +71,9 @@ void run(const Options& options, bool json) {
   const ForeignCamera camera =
       readForeignCamera(text, options.file, options.format, options.camera);
   for (const std::string& remark : camera.remarks) say(remark);
-  const ForeignFit fit = fitForeignCamera(camera, options.model, options.even_terms, options.knots);
+  const ForeignFit fit = namingSource(options.file, [&] {
+    return fitForeignCamera(camera, options.model, options.even_terms, options.knots);
+  });
   const double max_theta = fit.fit.lens->maxTheta();
   if (fit.field.image >= fit.field.one_to_one - 1e-9) {
     say("the source is one-to-one only up to " + formatFixed(max_theta * kDegrees, 1) +

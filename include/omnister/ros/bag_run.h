@@ -48,8 +48,9 @@ struct BagRunSummary {
   std::map<std::string, std::size_t> dropped;  ///< images and sets, by reason
 };
 
-/// Reads the bag twice: first poses and lenses, then images in the order of recording, so the same
-/// bag gives the same sets in every run.
+/// Looks first whether the file is a whole bag, then reads poses and lenses, then images in the
+/// order of recording, so the same bag gives the same sets in every run. Messages that are broken
+/// are left out and counted.
 /// @param wanted asked before a set is matched, with the stamp of its reference image [ns]
 /// @param take gets each cloud; an exception of it ends the run
 /// @throws InputError naming bag, topic and what is wrong, IoError

@@ -364,6 +364,29 @@ TEST_F(BadInput, NonsenseInThePlaceOfEveryNumberInAFile) {
   }
 }
 
+TEST_F(BadInput, WhatIsSoundAsAFileButUselessIsNamed) {
+  const auto changed = [](std::string text, const std::string& from, const std::string& to) {
+    const std::size_t at = text.find(from);
+    EXPECT_NE(at, std::string::npos) << from;
+    return text.replace(at, from.size(), to);
+  };
+  put("far.yaml", changed(readFile("lens.yaml"), "center: [31.2", "center: [99999"));
+  put("folded.yaml", changed(readFile("camera_info.yaml"), "[-0.2,", "[1e308,"));
+  writeFileAtomically("counts.tiff", [] {
+    std::vector<uchar> bytes;
+    cv::imencode(".tiff", cv::Mat(48, 64, CV_32SC1, cv::Scalar(7)), bytes);
+    return std::string(bytes.begin(), bytes.end());
+  }());
+  for (const auto& [file, arguments] : std::map<std::string, Arguments>{
+           {"far.yaml", {"export", "far.yaml", "--format", "kalibr", "--out", "camchain.yaml"}},
+           {"folded.yaml", {"import", "folded.yaml", "--out", "out.yaml"}},
+           {"counts.tiff",
+            {"dewarp", "--lens", "lens.yaml", "--size", "20x10", "counts.tiff", "out.png"}}}) {
+    EXPECT_FALSE(decent(arguments, file));
+    EXPECT_THAT(test::run(arguments).err, StartsWith("omnister: " + file + ": "));
+  }
+}
+
 TEST_F(BadInput, ADamagedImageIsOneLine) {
   std::string damaged = readFile("image.png");
   damaged[damaged.size() / 2] ^= 0x55;
