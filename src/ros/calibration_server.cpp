@@ -65,8 +65,6 @@ CalibrationParameters loadCalibrationParameters(Parameters& parameters) {
     throw InputError("~model", "",
                      "is '" + printable(result.model) + "', expected one of " + allModels());
   result.store = parameters.text("store", "");
-  if (result.store.empty())
-    throw InputError("~store", "", "is not set, expected a folder for lens files");
   result.camera_name = parameters.text("camera_name", result.camera_name);
   LensStore(result.store).pathOf(result.camera_name);  // refuses names that are no file names
   result.views = parameters.integer("views", result.views, 3, 1000);

@@ -8,6 +8,7 @@
 #include <nodelet/NodeletUnload.h>
 #include <ros/ros.h>
 #include <signal.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <atomic>
@@ -22,7 +23,15 @@ namespace {
 
 std::atomic<bool> stop{false};
 
-void onSignal(int /*number*/) { stop = true; }
+// What still waits for a master or a manager this long after it was told to end waits no more [s].
+constexpr unsigned kPatience = 3;
+
+void onSignal(int /*number*/) {
+  stop = true;
+  alarm(kPatience);
+}
+
+void onAlarm(int /*number*/) { ros::requestShutdown(); }
 
 class Keeper {
  public:
@@ -107,6 +116,9 @@ int main(int argc, char** argv) {
     std::fprintf(stderr, "usage: nodelet_node TYPE MANAGER\n");
     return 2;
   }
+  // Until there is a master, signals end it on the spot.
+  const ros::NodeHandle keep;
+  signal(SIGALRM, onAlarm);
   signal(SIGINT, onSignal);
   signal(SIGTERM, onSignal);
   if (signal(SIGHUP, onSignal) == SIG_IGN) signal(SIGHUP, SIG_IGN);

@@ -40,6 +40,8 @@ int runNode(int argc, char** argv, const std::string& name, const Body& body) {
   endBySignals();
   // Without any handle ROS ends, and with it its log: the reason why would not be told.
   const ros::NodeHandle keep;
+  // It was told to end while it waited for the master.
+  if (!ros::ok()) return 0;
   const std::shared_ptr<LoggerService> loggers = LoggerService::shared();
   try {
     return body(ros::NodeHandle(), ros::NodeHandle("~")) ? 0 : 1;

@@ -4,6 +4,7 @@
 services and parameters answer, that each comes back after it was killed and ends well when it is asked to."""
 import contextlib
 import itertools
+import os
 import re
 import signal
 import struct
@@ -56,10 +57,10 @@ class Program:
         space, _, name = self.name.rpartition('/')
         return [roslib.packages.find_node('omnister', kind)[0], '__ns:=' + (space or '/'), '__name:=' + name]
 
-    def start(self, kind, *more):
+    def start(self, kind, *more, environment=None):
         self.output = b''
         self.process = subprocess.Popen(self.command(kind) + self.arguments + list(more), stdin=subprocess.DEVNULL,
-                                        stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+                                        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment)
         self.reader = threading.Thread(target=self.read, args=(self.process.stdout,), daemon=True)
         self.reader.start()
 
@@ -370,6 +371,26 @@ class EveryNode(unittest.TestCase):
         other.start('nodelet_node')
         self.assertEqual(other.wait(), 1)
         self.assertIn('NoNodelet', other.output.decode())
+
+    def test_5_calibration_has_a_store_without_being_told_where(self):
+        alone = Program('/at_home/calibration', ['/at_home/coverage'],
+                        {'target': ROOT / 'config/demo/target.yaml', 'store': ''})
+        self.stack.callback(lambda: alone.process.poll() is None and alone.end(signal.SIGKILL))
+        alone.start('calibration_node', environment=dict(os.environ, ROS_HOME=str(self.work)))
+        self.assertTrue(eventually(lambda: Graph().offers(alone.name, '/at_home/coverage')), alone.output.decode())
+        self.assertEqual(alone.end(signal.SIGINT), 0, alone.output.decode())
+
+    def test_5_each_ends_while_it_waits_for_the_master(self):
+        nowhere = dict(os.environ, ROS_MASTER_URI='http://127.0.0.1:%d/' % demo.free_port())
+        ended = 0
+        for sign, kind in zip(itertools.cycle((signal.SIGINT, signal.SIGTERM, signal.SIGHUP)), self.programs):
+            # Nodes with parameters wait for it where ROS sets those, and are ended there by any signal.
+            alone = Program('/alone', [], arguments=[word for word in self.programs[kind].arguments if ':=' not in word])
+            alone.start(kind, environment=nowhere)
+            self.assertTrue(eventually(lambda: b'master' in alone.output), kind)
+            self.assertIn(alone.end(sign), (0, -sign), '%s: %s' % (kind, alone.output.decode()))
+            ended += 1
+        self.assertEqual(ended, 11)
 
     def test_6_what_was_killed_starts_anew_beside_the_others(self):
         for program in self.programs.values():
