@@ -18,6 +18,7 @@
 
 #include "omnister/common/error.h"
 #include "omnister/ros/logger_service.h"
+#include "run_node.h"
 
 namespace {
 
@@ -111,7 +112,7 @@ class Keeper {
 }  // namespace
 
 int main(int argc, char** argv) {
-  ros::init(argc, argv, "nodelet", ros::init_options::NoSigintHandler);
+  if (!omnister::initNode(argc, argv, "nodelet", ros::init_options::NoSigintHandler)) return 1;
   if (argc != 3) {
     std::fprintf(stderr, "usage: nodelet_node TYPE MANAGER\n");
     return 2;

@@ -5,7 +5,9 @@
 #include <ros/ros.h>
 
 #include <csignal>
+#include <cstdint>
 #include <initializer_list>
+#include <iostream>
 #include <memory>
 #include <string>
 
@@ -32,11 +34,23 @@ inline void endBySignals() {
   }
 }
 
+/// ros::init(). @return false where ROS refuses what it is given, a namespace with a blank say; it
+/// has been told then, on standard error as there is no log yet
+inline bool initNode(int& argc, char** argv, const std::string& name, std::uint32_t options = 0) {
+  try {
+    ros::init(argc, argv, name, options);
+    return true;
+  } catch (const std::exception& error) {
+    std::cerr << name << ": " << printable(error.what(), 1000) << '\n';
+    return false;
+  }
+}
+
 /// main() of a node. `body` gets the handle of the node's namespace and the private one, and says
 /// whether all went well. @return the exit code: 1 also for what it throws, which the log tells
 template <typename Body>
 int runNode(int argc, char** argv, const std::string& name, const Body& body) {
-  ros::init(argc, argv, name);
+  if (!initNode(argc, argv, name)) return 1;
   endBySignals();
   // Without any handle ROS ends, and with it its log: the reason why would not be told.
   const ros::NodeHandle keep;

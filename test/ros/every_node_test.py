@@ -380,6 +380,16 @@ class EveryNode(unittest.TestCase):
         self.assertTrue(eventually(lambda: Graph().offers(alone.name, '/at_home/coverage')), alone.output.decode())
         self.assertEqual(alone.end(signal.SIGINT), 0, alone.output.decode())
 
+    def test_5_names_that_ros_does_not_take_are_refused(self):
+        refused = 0
+        for kind, program in self.programs.items():
+            beside = Program('/a b/node', [], arguments=program.arguments)
+            beside.start(kind)
+            self.assertEqual(beside.wait(), 1, kind)
+            self.assertRegex(beside.output.decode(), r'(?i)^\w+: .*name', kind)
+            refused += 1
+        self.assertEqual(refused, 11)
+
     def test_5_each_ends_while_it_waits_for_the_master(self):
         nowhere = dict(os.environ, ROS_MASTER_URI='http://127.0.0.1:%d/' % demo.free_port())
         ended = 0
