@@ -127,33 +127,39 @@ std::optional<Header> tiffHeader(std::string_view data) {
 
 std::atomic<bool> decoders_are_silent{false};
 
-/// Standard error leads nowhere while there is one of these, where that is asked for.
+/// What decoders say on standard error stays here while there is one of these, where that is asked
+/// for. One at a time, so that it is known of which image they speak.
 class SilentStandardError {
  public:
   SilentStandardError() {
-    if (!wanted_) return;
-    const std::lock_guard<std::mutex> lock(mutex_);
-    if (users_++ > 0) return;
-    const int nowhere = ::open("/dev/null", O_WRONLY | O_CLOEXEC);
+    if (!decoders_are_silent) return;
+    lock_ = std::unique_lock(mutex_);
+    // What does not fit is lost.
+    if (::pipe2(pipe_, O_CLOEXEC | O_NONBLOCK) != 0) return;
     saved_ = ::fcntl(STDERR_FILENO, F_DUPFD_CLOEXEC, STDERR_FILENO + 1);
-    if (saved_ >= 0 && nowhere >= 0) ::dup2(nowhere, STDERR_FILENO);
-    if (nowhere >= 0) ::close(nowhere);
+    if (saved_ >= 0) ::dup2(pipe_[1], STDERR_FILENO);
   }
   ~SilentStandardError() {
-    if (!wanted_) return;
-    const std::lock_guard<std::mutex> lock(mutex_);
-    if (--users_ > 0 || saved_ < 0) return;
-    ::dup2(saved_, STDERR_FILENO);
-    ::close(saved_);
+    if (saved_ >= 0) ::dup2(saved_, STDERR_FILENO);
+    for (const int fd : {saved_, pipe_[0], pipe_[1]})
+      if (fd >= 0) ::close(fd);
   }
   SilentStandardError(const SilentStandardError&) = delete;
   SilentStandardError& operator=(const SilentStandardError&) = delete;
 
+  /// What was said since.
+  std::string said() const {
+    std::string text(pipe_[0] < 0 ? 0 : 1 << 16, '\0');
+    const ssize_t count = text.empty() ? 0 : ::read(pipe_[0], text.data(), text.size());
+    text.resize(count > 0 ? static_cast<std::size_t>(count) : 0);
+    return text;
+  }
+
  private:
-  const bool wanted_ = decoders_are_silent;
   static inline std::mutex mutex_;
-  static inline int users_ = 0;
-  static inline int saved_ = -1;
+  std::unique_lock<std::mutex> lock_;
+  int pipe_[2] = {-1, -1};
+  int saved_ = -1;
 };
 
 }  // namespace
@@ -183,14 +189,18 @@ cv::Mat readImage(const std::filesystem::path& path, ImageColor color, std::size
   if (color == ImageColor::kColor) flags |= cv::IMREAD_COLOR;
   if (color == ImageColor::kAsIs) flags = cv::IMREAD_UNCHANGED;
   cv::Mat image;
+  bool cut_off = false;
   try {
     const SilentStandardError silence;
     image = cv::imdecode(
         cv::Mat(1, static_cast<int>(data.size()), CV_8UC1, const_cast<char*>(data.data())), flags);
+    // Where a JPEG ends too soon its decoder fills up with grey, and calls that a success.
+    cut_off = silence.said().find("remature end of ") != std::string::npos;
   } catch (const cv::Exception& error) {
     throw InputError(name, "", "cannot be decoded: " + error.err);
   }
-  if (image.empty()) throw InputError(name, "", "cannot be decoded: the image data is damaged");
+  if (image.empty() || cut_off)
+    throw InputError(name, "", "cannot be decoded: the image data is damaged");
   return image;
 }
 

@@ -31,6 +31,7 @@ constexpr char kExtension[] = ".yaml";
 constexpr char kVersions[] = ".versions";
 constexpr std::size_t kMaxBytes = 16u << 20;
 constexpr std::size_t kMaxDigits = 9;
+constexpr int kLastVersion = 999999999;
 
 /// @return whether something stands there  @throws IoError, InputError for a link
 bool standsAt(const fs::path& path) {
@@ -75,6 +76,15 @@ std::vector<int> versionsIn(const fs::path& folder) {
     if (const auto version = versionOf(name)) versions.push_back(*version);
   std::sort(versions.begin(), versions.end());
   return versions;
+}
+
+/// One above the newest; where that is no version any more, the highest that is free.
+int freeVersion(const std::vector<int>& versions) {
+  if (versions.empty()) return 1;
+  int next = versions.back();
+  if (next < kLastVersion) return next + 1;
+  for (auto taken = versions.rbegin(); taken != versions.rend() && *taken == next; ++taken) --next;
+  return next;
 }
 
 fs::path versionPath(const fs::path& folder, int version) {
@@ -143,12 +153,11 @@ void LensStore::addVersion(const std::string& name, const std::string& bytes) co
   const fs::path folder = versionsOf(name);
   for (;;) {
     const std::vector<int> versions = versionsIn(folder);
-    int next = 1;
+    const int next = freeVersion(versions);
     if (!versions.empty()) {
       std::string newest;
       readStored(versionPath(folder, versions.back()), versions.back(), &newest);
       if (newest == bytes) return;
-      next = versions.back() + 1;
     }
     AtomicFile file(versionPath(folder, next));
     file.write(bytes);

@@ -22,9 +22,10 @@ enum class ImageColor { kGray, kColor, kAsIs };
 cv::Mat readImage(const std::filesystem::path& path, ImageColor color = ImageColor::kAsIs,
                   std::size_t max_pixels = 100'000'000);
 
-/// From now on nothing gets to standard error while readImage() decodes: image libraries print
-/// there what its error says too. For a program whose standard error is for a person alone; what
-/// other threads write there meanwhile is lost.
+/// From now on nothing gets to standard error while readImage() decodes, one image at a time: image
+/// libraries print there what its error says too. A JPEG that they say ends too soon is refused.
+/// For a program whose standard error is for a person alone; what other threads write there
+/// meanwhile is lost.
 void silenceDecoders();
 
 /// Writes by the extension: PNG, JPEG, TIFF, BMP, PGM or PPM. Atomic.

@@ -136,6 +136,20 @@ TEST_F(LensStoreTest, DropsTheOldestButNotTheCurrentOne) {
   EXPECT_EQ(versions().back(), 6);
 }
 
+TEST_F(LensStoreTest, GoesOnWhereTheNumbersEnd) {
+  store_.save("wide", lens(10));
+  const fs::path folder = store_.folder() / "wide.versions";
+  for (const char* name : {"999999999.yaml", "999999998.yaml", "1000000000.yaml", "-1.yaml"})
+    writeFileAtomically(folder / name, "no lens");
+  for (const double scale : {11, 12}) {
+    store_.save("wide", lens(scale));
+    EXPECT_EQ(current(), formatted(scale));
+  }
+  EXPECT_THAT(versions(), ElementsAre(999999999, 999999998, 999999997, 999999996, 1));
+  store_.rollBack("wide", 999999997);
+  EXPECT_EQ(current(), formatted(11));
+}
+
 TEST_F(LensStoreTest, TwoWritersAtOnceLoseNothing) {
   std::vector<std::thread> writers;
   for (int writer = 0; writer < 2; ++writer)

@@ -400,6 +400,15 @@ TEST_F(BadInput, ADamagedImageIsOneLine) {
     EXPECT_THAT(outcome.err, StartsWith("omnister: image.png: cannot be decoded"));
     EXPECT_EQ(std::count(outcome.err.begin(), outcome.err.end(), '\n'), 1) << outcome.err;
   }
+  // A JPEG that lost its second half, but has an end.
+  std::vector<uchar> jpeg;
+  cv::imencode(".jpg", cv::imread("displaced.png"), jpeg);
+  jpeg.erase(jpeg.begin() + static_cast<std::ptrdiff_t>(jpeg.size() / 2), jpeg.end() - 2);
+  put("half.jpg", std::string(jpeg.begin(), jpeg.end()));
+  const test::Outcome half =
+      test::run({"dewarp", "--lens", "lens.yaml", "--size", "20x10", "half.jpg", "out.png"});
+  EXPECT_EQ(half.err, "omnister: half.jpg: cannot be decoded: the image data is damaged\n");
+  EXPECT_FALSE(fs::exists("out.png"));
   // And standard error is what it was.
   EXPECT_NE(test::run({"dewarp", "--lens", "no.yaml", "image.png", "out.png"}).err, "");
 }
