@@ -145,8 +145,9 @@ int run(int argc, char** argv) {
     return app.exit(error) == 0 ? 0 : 2;
   }
   ::setenv("ROS_MASTER_URI", "http://localhost:11311", 0);
-  ros::init(argc, argv, "doctor",
-            keep_watching ? 0 : ros::init_options::AnonymousName | ros::init_options::NoRosout);
+  const std::uint32_t kind =
+      keep_watching ? 0 : ros::init_options::AnonymousName | ros::init_options::NoRosout;
+  if (!initNode(argc, argv, "doctor", kind)) return 1;
   endBySignals();
   // Its own words are its findings.
   if (ros::console::set_logger_level(ROSCONSOLE_DEFAULT_NAME, ros::console::levels::Fatal))

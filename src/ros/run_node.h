@@ -2,10 +2,12 @@
 #pragma once
 
 #include <ros/callback_queue.h>
+#include <ros/network.h>
 #include <ros/ros.h>
 
 #include <csignal>
 #include <cstdint>
+#include <cstdlib>
 #include <initializer_list>
 #include <iostream>
 #include <memory>
@@ -34,10 +36,18 @@ inline void endBySignals() {
   }
 }
 
-/// ros::init(). @return false where ROS refuses what it is given, a namespace with a blank say; it
-/// has been told then, on standard error as there is no log yet
+/// ros::init(). @return false where ROS refuses what it is given, a namespace with a blank say, or
+/// would end at a trap, with a master's address that is none. It has been told then, on standard
+/// error, as there is no log yet.
 inline bool initNode(int& argc, char** argv, const std::string& name, std::uint32_t options = 0) {
   try {
+    const char* master = std::getenv("ROS_MASTER_URI");
+    std::string host;
+    std::uint32_t port = 0;
+    if (master && !ros::network::splitURI(master, host, port)) {
+      throw InputError("ROS_MASTER_URI", "",
+                       "is \"" + printable(master) + "\", expected http://HOST:PORT/");
+    }
     ros::init(argc, argv, name, options);
     return true;
   } catch (const std::exception& error) {

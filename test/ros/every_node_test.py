@@ -387,6 +387,10 @@ class EveryNode(unittest.TestCase):
             beside.start(kind)
             self.assertEqual(beside.wait(), 1, kind)
             self.assertRegex(beside.output.decode(), r'(?i)^\w+: .*name', kind)
+            beside = Program('/node', [], arguments=program.arguments)
+            beside.start(kind, environment=dict(os.environ, ROS_MASTER_URI='nonsense'))
+            self.assertEqual(beside.wait(), 1, kind)
+            self.assertIn('ROS_MASTER_URI: is "nonsense"', beside.output.decode(), kind)
             refused += 1
         self.assertEqual(refused, 11)
 
