@@ -11,7 +11,6 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <cstring>
 #include <optional>
 #include <set>
 #include <utility>
@@ -36,63 +35,6 @@ WorkerSettings settingsOf(const BagRunOptions& options) {
   settings.matcher = options.matcher;
   settings.matching = options.matching;
   return settings;
-}
-
-/// Steps over the fields of a serialized message. roscpp makes room for what a length claims before
-/// it looks whether there is so much.
-class Fields {
- public:
-  Fields(const std::uint8_t* bytes, std::size_t size) : at_(bytes), left_(size) {}
-
-  bool skip(std::uint64_t count) {
-    if (count > left_) return false;
-    at_ += count;
-    left_ -= count;
-    return true;
-  }
-  bool length(std::uint32_t& count) {
-    if (left_ < sizeof count) return false;
-    std::memcpy(&count, at_, sizeof count);
-    return skip(sizeof count);
-  }
-  /// As many things of `size` bytes as a length says.
-  bool list(std::size_t size) {
-    std::uint32_t count = 0;
-    return length(count) && skip(std::uint64_t{count} * size);
-  }
-  bool text() { return list(1); }
-  bool header() { return skip(12) && text(); }
-
- private:
-  const std::uint8_t* at_;
-  std::size_t left_;
-};
-
-/// Whether all that a message's lengths claim is there.
-template <typename Message>
-bool isWhole(Fields fields);
-
-template <>
-bool isWhole<sensor_msgs::Image>(Fields fields) {
-  return fields.header() && fields.skip(8) && fields.text() && fields.skip(5) && fields.list(1);
-}
-
-template <>
-bool isWhole<tf2_msgs::TFMessage>(Fields fields) {
-  std::uint32_t count = 0;
-  bool whole = fields.length(count);
-  for (; whole && count > 0; --count)
-    whole = fields.header() && fields.text() && fields.skip(7 * sizeof(double));
-  return whole;
-}
-
-template <>
-bool isWhole<LensModelMessage>(Fields fields) {
-  std::uint32_t names = 0;
-  bool whole = fields.header() && fields.skip(8) && fields.text() &&
-               fields.skip(3 * sizeof(double)) && fields.length(names);
-  for (; whole && names > 0; --names) whole = fields.text();
-  return whole && fields.list(sizeof(double)) && fields.skip(2 * sizeof(double)) && fields.text();
 }
 
 class BagRun {
@@ -182,7 +124,6 @@ class BagRun {
       std::vector<std::uint8_t> bytes(instance.size());
       ros::serialization::OStream to(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
       instance.write(to);
-      if (!isWhole<Message>({bytes.data(), bytes.size()})) return nullptr;
       const auto message = boost::make_shared<Message>();
       ros::serialization::IStream from(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
       ros::serialization::deserialize(from, *message);
