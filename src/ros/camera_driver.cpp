@@ -95,7 +95,8 @@ CameraParameters loadCameraParameters(const ros::NodeHandle& private_node) {
   Parameters source(private_node);
   CameraParameters p;
   p.device = source.text("device", p.device);
-  source.file("device", p.device, device::checkCameraDevice);
+  // Not given: it goes on to say so, as of a camera that is not there.
+  if (source.has("device")) source.file("device", p.device, device::checkCameraDevice);
   p.frame_id = source.frame("frame_id", p.frame_id);
   const std::string url = source.text("camera_info_url", "");
   p.lens = source.text("lens", pathOfUrl(url));

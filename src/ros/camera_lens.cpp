@@ -28,6 +28,15 @@ CameraLens::Calibrated CameraLens::calibrated() const {
   return {lens_ != nullptr, problem_};
 }
 
+void CameraLens::checkSize(cv::Size size) const {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  if (size_.empty() || size == size_ || (region_ && size == region_->sensor)) return;
+  throw InputError("set_camera_info", "width, height",
+                   "are " + std::to_string(size.width) + ", " + std::to_string(size.height) +
+                       ", expected the images' " + std::to_string(size_.width) + ", " +
+                       std::to_string(size_.height));
+}
+
 void CameraLens::show(const device::SensorRegion& region) {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
@@ -41,13 +50,14 @@ void CameraLens::show(const device::SensorRegion& region) {
 
 sensor_msgs::CameraInfoPtr CameraLens::infoFor(const device::Frame& frame) {
   if (frame.region) show(*frame.region);
+  const cv::Size size = frame.image.size();
   std::shared_ptr<const Lens> lens;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     lens = lens_;
+    size_ = size;
   }
   auto info = boost::make_shared<sensor_msgs::CameraInfo>();
-  const cv::Size size = frame.image.size();
   const bool part = frame.region && !frame.region->whole();
   if (lens && lens->file.image_size == size) {
     // Calibrated as it streams, a part of the sensor or not.
@@ -161,6 +171,7 @@ bool CameraLens::setCameraInfo(sensor_msgs::SetCameraInfo::Request& request,
                                sensor_msgs::SetCameraInfo::Response& response) {
   try {
     LensFile file = fromCameraInfo(request.camera_info, "set_camera_info");
+    checkSize(file.image_size);
     file.camera_name = storeName();
     const std::filesystem::path path = LensStore(store_).save(file.camera_name, file);
     set(std::move(file));

@@ -10,6 +10,7 @@
 
 #include "omnister/common/error.h"
 #include "omnister/ros/conversions.h"
+#include "omnister/ros/parameters.h"
 
 namespace omnister {
 namespace {
@@ -88,6 +89,8 @@ void checkFrame(const sensor_msgs::Image& image, cv::Size expected, const std::s
   if (image.header.stamp.isZero()) refuse("header.stamp", "is 0, expected the time of exposure");
   if (image.header.frame_id.empty())
     refuse("header.frame_id", "is empty, expected the optical frame");
+  if (image.header.frame_id.size() > kLongestFrame)
+    refuse("header.frame_id", "is longer than " + std::to_string(kLongestFrame) + " characters");
   if (expected.area() > 0 && (static_cast<int>(image.width) != expected.width ||
                               static_cast<int>(image.height) != expected.height))
     refuse("size", "is " + std::to_string(image.width) + "x" + std::to_string(image.height) +

@@ -12,8 +12,6 @@
 namespace omnister {
 namespace {
 
-constexpr std::size_t kLongestFrame = 255;
-
 std::string shown(XmlRpc::XmlRpcValue value) {
   if (value.getType() == XmlRpc::XmlRpcValue::TypeString) {
     return "\"" + printable(static_cast<std::string&>(value)) + "\"";

@@ -492,8 +492,12 @@ PoseAnswer StereoPipeline::cameraPose(const std::string& frame_id, std::int64_t 
     answer.state = PoseAnswer::State::kKnown;
   } catch (const tf2::ExtrapolationException& error) {
     answer.reason = printable(error.what(), 300);
-    const bool past = answer.reason.find("into the past") != std::string::npos;
-    if (past && forgetFuture(frame_id)) answer.reason = "tf ran ahead of the clock: it starts anew";
+    bool past = answer.reason.find("into the past") != std::string::npos;
+    // Of a fixed frame that somebody hung below another one tf says that it is that one's future.
+    if ((past || stamp < ros::Time::now()) && forgetFuture(frame_id)) {
+      answer.reason = "tf ran ahead of the clock: it starts anew";
+      past = true;
+    }
     answer.state = past ? PoseAnswer::State::kNever : PoseAnswer::State::kLater;
   } catch (const tf2::TransformException& error) {
     // A frame that nobody has published yet may still come.

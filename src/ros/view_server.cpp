@@ -21,7 +21,7 @@ namespace enc = sensor_msgs::image_encodings;
 constexpr std::uint32_t kLensesWaiting = 16;  // in a shorter queue the one that counts may be lost
 constexpr double kWidestPinhole = 3.0;        // [rad]
 constexpr double kWarningPeriod = 5.0;        // [s]
-constexpr std::size_t kMostFrames = 16, kLongestFrame = 255;
+constexpr std::size_t kMostFrames = 16;
 
 /// "camera_optical" -> "camera_view_optical".
 std::string viewFrame(const std::string& camera_frame) {

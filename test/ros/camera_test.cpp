@@ -441,6 +441,14 @@ TEST_F(CameraTest, KeepsACalibrationThatItIsGiven) {
     EXPECT_FALSE(call.response.success) << f;
     EXPECT_NE(call.response.status_message, "");
   }
+  // Nor does what is of other images.
+  const std::size_t had = infos.size();
+  ASSERT_TRUE(eventually([&] { return infos.size() > had + 1; }));
+  info.K[0] = 4.0;
+  info.width = 400;
+  ASSERT_TRUE(ros::service::call(node_.resolveName("set_camera_info"), call));
+  EXPECT_FALSE(call.response.success);
+  EXPECT_THAT(call.response.status_message, HasSubstr("expected the images' 8, 6"));
   EXPECT_EQ(models.size(), 1u);
 }
 

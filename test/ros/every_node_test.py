@@ -277,6 +277,12 @@ class EveryNode(unittest.TestCase):
         transform = TransformStamped(header=end, child_frame_id='nowhere')
         transform.transform.rotation.w = 1.0
         hostile.append(('/tf', TFMessage([transform])))
+        # A frame above the fixed one, in a loop at that, and the carriage an hour ahead of its time.
+        for frame, child, ahead in (('camera_optical', 'stage_base', 0), ('stage_base', 'stage_carriage', 3600)):
+            stray = TransformStamped(header=Header(stamp=rospy.Time.now() + rospy.Duration(ahead), frame_id=frame),
+                                     child_frame_id=child)
+            stray.transform.rotation.w = 1.0
+            hostile.append(('/tf', TFMessage([stray])))
         hostile.append(('/stage/stage_state', self.rig.msg.StageState(header=end)))
         publishers = []
         for topic, message in hostile:

@@ -57,6 +57,8 @@ class CameraLens {
   };
 
   std::string storeName() const;
+  /// @throws InputError where the images, or the sensor, have another size
+  void checkSize(cv::Size size) const;
   /// The images show this part of the sensor from now on.
   void show(const device::SensorRegion& region);
   void publish();
@@ -72,7 +74,8 @@ class CameraLens {
   mutable std::mutex mutex_;  ///< guards what follows up to the publisher
   std::string serial_;
   std::shared_ptr<const Lens> lens_;
-  std::optional<device::SensorRegion> region_;  ///< of the last frame
+  std::optional<device::SensorRegion> region_;  ///< of the last frame, as its size
+  cv::Size size_;
   std::string published_;
   std::string problem_;
   ros::Publisher publisher_;

@@ -15,6 +15,8 @@
 
 namespace omnister {
 
+inline constexpr std::size_t kLongestFrame = 255;  ///< of names of frames that we take [characters]
+
 /// What `read` makes of a file that a parameter names. What goes wrong names the parameter, too.
 template <typename Read>
 auto fromFileOf(const ros::NodeHandle& private_node, const std::string& key, const Read& read) {

@@ -6,12 +6,17 @@
 #include <tf2_msgs/TFMessage.h>
 #include <tf2_ros/buffer.h>
 
+#include <set>
+#include <string>
+
 #include "omnister/ros/callback_threads.h"
 
 namespace omnister {
 
 /// Fills a buffer from /tf and /tf_static in a thread of its own, as tf2_ros::TransformListener
-/// does; but a stamp that ROS cannot reckon with ends no process, whoever sends it.
+/// does; but a stamp that ROS cannot reckon with ends no process, whoever sends it, and what is no
+/// transform is refused here, where that is told now and then only. Of frames it takes a bounded
+/// number.
 class TransformInput {
  public:
   /// @param buffer lives longer
@@ -22,10 +27,13 @@ class TransformInput {
 
  private:
   void take(const ros::MessageEvent<const tf2_msgs::TFMessage>& event, bool is_static);
+  /// @throws Error saying why a transform is none
+  void check(const geometry_msgs::TransformStamped& transform);
 
   CallbackThreads callbacks_;  // before all that uses it
   tf2_ros::Buffer& buffer_;
-  ros::Time newest_;  ///< time of the message before
+  ros::Time newest_;              ///< time of the message before
+  std::set<std::string> frames_;  ///< that were taken: tf2 keeps their names for ever
   ros::Subscriber moving_, fixed_;
 };
 
