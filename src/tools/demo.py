@@ -85,6 +85,9 @@ class Processes:
                 log.flush()
                 watch(line.decode('utf-8', 'replace').rstrip())
 
+    def ended(self, name):
+        return any(process.poll() is not None for known, process in self.running if known == name)
+
     def stop(self, name, seconds=15.0):
         for entry in [e for e in self.running if e[0] == name]:
             self.running.remove(entry)
@@ -353,8 +356,9 @@ def conduct(options, clock, processes, work):
     clock.say('stage: homed')
     lens_file = rig.calibrate()
 
+    rviz = ['rviz', '-d', str(Path(package_folder()) / 'config' / 'demo.rviz')]
     if options.headless:
-        processes.start('rviz', ['rviz', '-d', str(Path(package_folder()) / 'config' / 'demo.rviz')])
+        processes.start('rviz', rviz)
     rig.watch_clouds()
     rig.scan(POSITIONS)
     if not options.headless:
@@ -378,6 +382,12 @@ def conduct(options, clock, processes, work):
     shutil.copyfile(lens_file, work / 'lens.yaml')
     clock.say('saving: ' + rig.call('/camera/snapshot/save', rig.Trigger))
     processes.stop('rosbag')
+    if processes.ended('rviz'):
+        # Now and then Debian's aborts at a lock of its own as it starts.
+        clock.say('rviz ended: it is started once more, for another scan')
+        processes.stop('rviz')
+        processes.start('rviz', rviz)
+        rig.scan(POSITIONS[::-1])
     clock.say('taking the picture')
     take_picture(display, work / 'cloud.png')
     processes.stop('rviz', 5.0)

@@ -175,7 +175,7 @@ TEST_F(Bag, LengthsInMessagesThatLie) {
   recording.bag().write("/tf", kBegin, recordedAs<tf2_msgs::TFMessage>({255, 255, 255, 0}));
   bytes = serialized(toLensModelMessage(views().lens, {}));
   std::fill(bytes.end() - 4, bytes.end(), 0xff);
-  for (std::size_t size = 0; size < bytes.size(); size += 1 + bytes.size() / 50)
+  for (std::size_t size = 1; size < bytes.size(); size += 1 + bytes.size() / 50)
     recording.bag().write("/camera/lens_model", kBegin,
                           recordedAs<LensModelMessage>({bytes.begin(), bytes.begin() + size}));
   recording.frame(1, test::kBaseline, views().right);
