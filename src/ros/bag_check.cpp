@@ -44,7 +44,7 @@ class Memory : public Source {
   explicit Memory(std::vector<std::uint8_t> bytes) : bytes_(std::move(bytes)) {}
   std::uint64_t size() const override { return bytes_.size(); }
   void read(std::uint64_t at, void* to, std::size_t count) override {
-    std::memcpy(to, bytes_.data() + at, count);
+    std::copy_n(bytes_.data() + at, count, static_cast<std::uint8_t*>(to));
   }
 
  private:
@@ -76,7 +76,7 @@ class File : public Source {
       begin_ = at;
       fill();
     }
-    std::memcpy(to, window_.data() + (at - begin_), count);
+    std::copy_n(window_.data() + (at - begin_), count, static_cast<char*>(to));
   }
 
  private:
