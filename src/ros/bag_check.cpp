@@ -159,14 +159,15 @@ class BagCheck {
     header_.resize(length);
     source.read(at + 4, header_.data(), length);
     Record out;
-    parseFields(header_, out);
+    parseFields(header_, out.fields);
+    out.op = number<std::uint8_t>(out, "op");
     out.data = at + 4 + length + 4;
     out.size = take<std::uint32_t>(source, out.data - 4);
     need(out.data, out.size);
     return out;
   }
 
-  void parseFields(std::string_view text, Record& out) const {
+  void parseFields(std::string_view text, std::map<std::string, std::string>& fields) const {
     while (!text.empty()) {
       std::uint32_t length = 0;
       if (text.size() < sizeof length) refuse("a record's header is damaged");
@@ -177,10 +178,9 @@ class BagCheck {
       if (field.size() != length || equals == std::string_view::npos)
         refuse("a record's header is damaged");
       // The last of equal names counts, as for rosbag.
-      out.fields[std::string(field.substr(0, equals))] = field.substr(equals + 1);
+      fields[std::string(field.substr(0, equals))] = field.substr(equals + 1);
       text.remove_prefix(length);
     }
-    out.op = number<std::uint8_t>(out, "op");
   }
 
   const std::string& field(const Record& record, const char* name) const {
@@ -297,6 +297,12 @@ class BagCheck {
     const Record connection = record(file_, at);
     if (connection.op != kConnection) refuse("a topic is missing from the index");
     if (field(connection, "topic").empty()) refuse("a topic has no name");
+    // What describes the topic has the form of a header, too.
+    if (connection.size > kMaxHeader) refuse("what describes a topic is too long");
+    header_.resize(connection.size);
+    file_.read(connection.data, header_.data(), header_.size());
+    std::map<std::string, std::string> described;
+    parseFields(header_, described);
     connections_.insert(number<std::uint32_t>(connection, "conn"));
     return connection.end();
   }
