@@ -1,5 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // rosbag itself trusts a bag: none that is taken may lead it out of its memory, or to an end.
+// As all of the ROS layer, before what else there is of ROS.
+#include "omnister/ros/checked_lengths.h"
+//
 #include <console_bridge/console.h>
 #include <rosbag/bag.h>
 #include <rosbag/view.h>
