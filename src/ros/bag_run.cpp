@@ -117,20 +117,13 @@ class BagRun {
   template <typename Message>
   static boost::shared_ptr<const Message> read(const rosbag::MessageInstance& instance,
                                                std::string* problem) {
-    *problem = "message of another type on " + instance.getTopic();
-    if (!instance.isType<Message>()) return nullptr;
-    *problem = "broken message on " + instance.getTopic();
     try {
-      std::vector<std::uint8_t> bytes(instance.size());
-      ros::serialization::OStream to(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
-      instance.write(to);
-      const auto message = boost::make_shared<Message>();
-      ros::serialization::IStream from(bytes.data(), static_cast<std::uint32_t>(bytes.size()));
-      ros::serialization::deserialize(from, *message);
-      return message;
-    } catch (const std::exception& error) {
-      return nullptr;
+      if (auto message = instance.instantiate<Message>()) return message;
+      *problem = "message of another type on " + instance.getTopic();
+    } catch (const std::exception&) {
+      *problem = "broken message on " + instance.getTopic();
     }
+    return nullptr;
   }
 
   template <typename Message>
@@ -267,8 +260,7 @@ class BagRun {
     policy.setMaxIntervalDuration(ros::Duration(options_.max_skew));
     synchronizer_ =
         std::make_unique<message_filters::Synchronizer<Policy>>(static_cast<const Policy&>(policy));
-    synchronizer_->registerCallback(
-        boost::bind(&BagRun::keepPair, this, boost::placeholders::_1, boost::placeholders::_2));
+    synchronizer_->registerCallback(&BagRun::keepPair, this);
   }
 
   void keepPair(const sensor_msgs::ImageConstPtr& left, const sensor_msgs::ImageConstPtr& right) {
