@@ -95,10 +95,6 @@ std::size_t FitInput::cornerCount() const {
   return count;
 }
 
-int FitInput::poseCount() const {
-  return pose.empty() ? 0 : 1 + *std::max_element(pose.begin(), pose.end());
-}
-
 BundleOptions FitInput::freedom() const {
   BundleOptions options;
   options.warp = warp;

@@ -29,7 +29,6 @@ struct FitInput {
   bool warp = true;
 
   std::size_t cornerCount() const;
-  int poseCount() const;
   /// What an adjustment of the lens is to free.
   BundleOptions freedom() const;
   /// The views that `keep` marks. Poses keep their numbers.

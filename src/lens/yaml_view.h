@@ -25,7 +25,6 @@ class YamlView {
 
   bool isSequence() const { return node_.IsSequence(); }
   bool isMap() const { return node_.IsMap(); }
-  bool isScalar() const { return node_.IsScalar(); }
 
   std::string text() const;
   double number() const;  ///< finite

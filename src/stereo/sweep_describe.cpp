@@ -101,7 +101,7 @@ void describeTile(const Level& level, bool finest, const Tile& tile, const Band&
       }
       if (!found) continue;
       d_phi *= static_cast<float>(band.step_phi);
-      d_a *= static_cast<float>(band.step_h / level.grid.column_scale);
+      d_a *= static_cast<float>(band.step_h);
       constexpr float kLongest = 2.8f;
       if (d_phi.norm() > kLongest) d_phi *= kLongest / d_phi.norm();
       if (d_a.norm() > kLongest) d_a *= kLongest / d_a.norm();

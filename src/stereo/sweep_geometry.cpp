@@ -81,19 +81,12 @@ WideLens widen(const LensPtr& lens) {
   return wide;
 }
 
-double thetaOf(Axis axis, double a) { return axis == Axis::kAngle ? a : std::atan2(1.0, -a); }
-
-double axisOf(Axis axis, double theta) {
-  return axis == Axis::kAngle ? theta : -std::cos(theta) / std::max(std::sin(theta), 1e-6);
-}
-
 namespace {
 
 /// What a pixel is made from: rays at the corners of cells, and the lens where there are none.
 struct RayNodes {
   const WideLens& lens;
   const EpipolarFrame& frame;
-  Axis axis;
   int scale;
   int nodes_x;
   Eigen::Vector3f axis_z;
@@ -118,13 +111,12 @@ struct RayNodes {
 
   float depth(const Eigen::Vector3f& ray) const { return axis_z.dot(ray); }
 
-  /// phi [1 / kPhiUnits rad] and the axis coordinate.
+  /// phi [1 / kPhiUnits rad] and theta [rad].
   std::pair<float, float> coordinates(const Eigen::Vector3f& ray) const {
     const float radius = std::sqrt(ray.y() * ray.y() + ray.z() * ray.z());
     const float angle = smoothAtan2(ray.z(), ray.y());
-    const float along = axis == Axis::kAngle ? smoothAtan2(radius, ray.x())
-                                             : -ray.x() / (radius > 1e-6f ? radius : 1e-6f);
-    return {(angle + static_cast<float>(kPi)) * static_cast<float>(kPhiUnits), along};
+    return {(angle + static_cast<float>(kPi)) * static_cast<float>(kPhiUnits),
+            smoothAtan2(radius, ray.x())};
   }
 };
 
@@ -146,17 +138,15 @@ int maskOf(const cv::Mat& mask, const cv::Rect& pixels, int scale) {
 }  // namespace
 
 ReferenceMap makeReferenceMap(const WideLens& lens, cv::Size full_size, int level,
-                              const EpipolarFrame& frame, Axis axis, const cv::Mat& mask,
-                              int threads) {
+                              const EpipolarFrame& frame, const cv::Mat& mask, int threads) {
   constexpr int kCell = ReferenceMap::kCell;
   const int scale = 1 << level;
   ReferenceMap map;
   map.size =
       cv::Size((full_size.width + scale - 1) / scale, (full_size.height + scale - 1) / scale);
-  map.axis = axis;
   map.cells = cv::Size((map.size.width + kCell - 1) / kCell, (map.size.height + kCell - 1) / kCell);
   const int nodes_x = map.cells.width + 3, nodes_y = map.cells.height + 3;
-  RayNodes rays{lens, frame, axis, scale, nodes_x, frame.basis.col(2).cast<float>()};
+  RayNodes rays{lens, frame, scale, nodes_x, frame.basis.col(2).cast<float>()};
   rays.nodes.resize(static_cast<std::size_t>(nodes_x) * nodes_y);
   map.node_phi.assign(rays.nodes.size() + 64, kNaN);
   map.node_a.assign(rays.nodes.size() + 64, kNaN);
@@ -212,8 +202,7 @@ ReferenceMap makeReferenceMap(const WideLens& lens, cv::Size full_size, int leve
         // Both as angles between rays.
         const float enough = 2e-5f * static_cast<float>(scale);
         const float sine = std::sqrt(ray.y() * ray.y() + ray.z() * ray.z()) / ray.norm();
-        const float slope = axis == Axis::kAngle ? 1.0f : sine * sine;
-        smooth = smooth && std::fabs(a - a_between) * slope < enough &&
+        smooth = smooth && std::fabs(a - a_between) < enough &&
                  std::fabs(phi - phi_between) * sine < enough * static_cast<float>(kPhiUnits);
       }
       if (smooth) kind = ReferenceMap::kInterpolated;
@@ -316,15 +305,11 @@ void viewMap(const ReferenceMap& map, const cv::Rect& rect, MapView* view) {
 void hypothesisRange(const HypothesisLimits& limits, double theta, double* least, double* most) {
   const double b = limits.baseline, sine = std::max(std::sin(theta), 1e-6);
   const auto at = [&](double range) {
-    if (limits.axis == Axis::kInverse) return 1.0 / (range * sine);
     return std::atan2(range * sine, range * std::cos(theta) - b) - theta;
   };
   *least = limits.max_range > 0 ? at(limits.max_range) : 0.0;
-  if (limits.min_range > 0)
-    *most = at(limits.min_range);
-  else
-    *most = limits.axis == Axis::kInverse ? 1.0 / (4 * b * sine) : std::atan(0.25);
-  if (limits.axis == Axis::kAngle) *most = std::min(*most, kPi - theta);
+  *most = limits.min_range > 0 ? at(limits.min_range) : std::atan(0.25);
+  *most = std::min(*most, kPi - theta);
   *most = std::max(*most, *least);
 }
 
@@ -419,7 +404,7 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
         tile.a_max = a_max;
         tile.phi_min = phi_min;
         tile.phi_max = phi_max;
-        const double theta_min = thetaOf(map.axis, a_min), theta_max = thetaOf(map.axis, a_max);
+        const double theta_min = a_min, theta_max = a_max;
         scale.left = theta_min + theta_max < kPi;
         double h_min = std::numeric_limits<double>::max(), h_max = 0;
         for (int i = 0; i <= 4; ++i) {
@@ -443,7 +428,6 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
   std::sort(all_a.begin(), all_a.end());
   // A row is 0.7 to 1.4 pixels everywhere; a column one pixel where most pixels are.
   const double phi_reference = all_phi.back(), a_reference = all_a[all_a.size() * 6 / 10];
-  const double per_h = map.axis == Axis::kInverse ? limits.baseline : 1.0;
   std::map<std::tuple<int, int, bool>, int> keys;
   for (std::size_t i = 0; i < layout.tiles.size(); ++i) {
     Tile& tile = layout.tiles[i];
@@ -456,7 +440,7 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
     if (fresh) {
       Band band;
       band.step_phi = std::exp2(p) / phi_reference;
-      band.step_h = std::exp2(q) / (a_reference * per_h);
+      band.step_h = std::exp2(q) / a_reference;
       layout.bands.push_back(band);
     }
     tile.band = found->second;
@@ -475,10 +459,9 @@ Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::S
 }
 
 Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& frame,
-              double column_sign_scale, const WideLens& lens, cv::Size full_size, int level,
+              const WideLens& lens, cv::Size full_size, int level,
               const Eigen::Matrix3d& R_ref_disp, int halo, int threads) {
   Grid grid;
-  grid.column_scale = column_sign_scale;
   grid.bands = layout->bands;
   const int scale = 1 << level;
   const int width = (full_size.width + scale - 1) / scale;
@@ -503,7 +486,7 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
     if (tile.band < 0) continue;
     const Band& band = grid.bands[tile.band];
     const double to_row = 1.0 / (kPhiUnits * band.step_phi), row0 = -kPi / band.step_phi;
-    const double to_column = column_sign_scale / band.step_h;
+    const double to_column = 1.0 / band.step_h;
     const double least = tile.h_min / band.step_h, most = tile.h_max / band.step_h;
     auto& [first_row, last_row] = row_range[tile.band];
     const cv::Rect rect = tile.rect;
@@ -580,14 +563,13 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
       R_ref_disp.transpose() * frame.basis.transpose();  // columns e, m, n
   const auto rayOf = [&](const Band& band, double row, double column) {
     const double phi = (row - band.row_offset) * band.step_phi - kPi;
-    const double theta = thetaOf(map.axis, column * band.step_h / column_sign_scale);
+    const double theta = column * band.step_h;
     return Eigen::Vector3d(turned * Eigen::Vector3d(std::cos(theta),
                                                     std::sin(theta) * std::cos(phi),
                                                     std::sin(theta) * std::sin(phi)));
   };
   const auto legal = [&](const Band& band, double column) {
-    if (map.axis == Axis::kInverse) return true;
-    const double theta = column * band.step_h / column_sign_scale;
+    const double theta = column * band.step_h;
     return theta >= -0.05 && theta <= kPi + 0.05;
   };
   const auto project = [&](const Band& band, double row, double column) {
@@ -629,7 +611,7 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
     });
     std::vector<std::pair<double, double>> circle(hi - lo + 1);
     for (int column = lo; column <= hi; ++column) {
-      const double theta = thetaOf(map.axis, column * band.step_h / column_sign_scale);
+      const double theta = column * band.step_h;
       circle[column - lo] = {std::cos(theta), std::sin(theta)};
     }
     parallelFor(0, band.rows, threads, [&](std::size_t r) {
@@ -733,10 +715,8 @@ Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& fram
       return static_cast<int>(std::lround(phi * band.row_scale + band.row_offset));
     };
     const int first_row = rowOf(tile.phi_min), last_row = rowOf(tile.phi_max);
-    const double ends[2] = {tile.a_min * column_sign_scale / band.step_h,
-                            tile.a_max * column_sign_scale / band.step_h};
-    const double lowest = std::min(ends[0], ends[1]) + tile.h_min / band.step_h - 2;
-    const double highest = std::max(ends[0], ends[1]) + tile.h_max / band.step_h + 2;
+    const double lowest = tile.a_min / band.step_h + tile.h_min / band.step_h - 2;
+    const double highest = tile.a_max / band.step_h + tile.h_max / band.step_h + 2;
     bool clear = first_row >= 0 && last_row < band.rows;
     for (int r = first_row; clear && r <= last_row; ++r) {
       const int from = static_cast<int>(std::floor(lowest)) - band.begin[r];

@@ -3,11 +3,9 @@
 ///
 /// With e the unit baseline, a ray has phi, the angle of its epipolar plane about e, and theta, its
 /// angle from e. Seen from the displaced camera (its rays turned into the reference orientation) a
-/// point keeps phi and has theta' >= theta. Along an epipolar curve we count in an axis coordinate:
-///     kAngle:    a = theta         a' = a + delta,    delta the parallax angle [rad]
-///     kInverse:  a = -cot(theta)   a' = a + b q,      q = 1 / rho [1/m], rho the distance from the
-///     axis
-/// so a hypothesis h (delta or q) is a shift along a row of a (phi, a) grid. Descriptors of the
+/// point keeps phi and has theta' >= theta. Along an epipolar curve the coordinate is a = theta,
+/// and a hypothesis h is the parallax angle theta' - theta [rad]: a shift along a row of a (phi, a)
+/// grid. Descriptors of the
 /// displaced image are stored on such grids, in bands: each tile of the reference image uses the
 /// band whose steps are about a pixel there, and a band holds what its tiles can reach and no more.
 #pragma once
@@ -21,8 +19,6 @@
 #include "omnister/lens/lens_model.h"
 
 namespace omnister::sweep {
-
-enum class Axis { kAngle, kInverse };
 
 /// Rows are e, m, n: right-handed, m as near to the reference's optical axis as it can be.
 struct EpipolarFrame {
@@ -53,11 +49,10 @@ struct ReferenceMap {
   static constexpr int kCell = 16;  ///< pixels
   static constexpr std::int32_t kInterpolated = -1, kNothing = -2;
   cv::Size size;
-  Axis axis = Axis::kAngle;
   cv::Size cells;
   /// Corners, the first one cell before the image; cells.width + 3 a row.
-  std::vector<float> node_phi;  ///< [1 / kPhiUnits rad]
-  std::vector<float> node_a;
+  std::vector<float> node_phi;      ///< [1 / kPhiUnits rad]
+  std::vector<float> node_a;        ///< theta [rad]
   std::vector<std::int32_t> exact;  ///< by cell: kInterpolated, kNothing or its place in the next
   std::vector<std::uint16_t> exact_phi;
   std::vector<float> exact_a;
@@ -67,8 +62,7 @@ struct ReferenceMap {
 /// @param level the image is reduced 2^level times; pixel u of it is (u + 0.5) 2^level - 0.5
 /// @param mask CV_8UC1 of the full size or empty; 0 leaves a pixel out (all of a reduced pixel's)
 ReferenceMap makeReferenceMap(const WideLens& lens, cv::Size full_size, int level,
-                              const EpipolarFrame& frame, Axis axis, const cv::Mat& mask,
-                              int threads);
+                              const EpipolarFrame& frame, const cv::Mat& mask, int threads);
 
 /// Epipolar coordinates of a rectangle, pixel by pixel.
 struct MapView {
@@ -76,7 +70,7 @@ struct MapView {
   cv::Rect rect;  ///< what is here, at least; pixels beyond the image are those at its edge
   int left = 0, stride = 0;
   std::vector<std::uint16_t> phi;  ///< kNoRay where there is no ray
-  std::vector<float> a;            ///< axis coordinate; anything where there is no ray
+  std::vector<float> a;            ///< theta [rad]; anything where there is no ray
 
   std::size_t at(int x, int y) const {
     return static_cast<std::size_t>(y - rect.y) * stride + (x - left);
@@ -89,10 +83,6 @@ void viewMap(const ReferenceMap& map, const cv::Rect& rect, MapView* view);
 /// Pixels around a tile that its local frames look at.
 inline constexpr int kViewHalo = 6;
 
-/// Axis coordinate to theta [rad] and back.
-double thetaOf(Axis axis, double a);
-double axisOf(Axis axis, double theta);
-
 /// Movement over the image along the two epipolar coordinates at a pixel of the view.
 /// @param d_phi [out] [px/rad]  @param d_a [out] [px per unit of a]
 /// @return false where there are not enough rays around
@@ -102,9 +92,9 @@ bool localFrame(const MapView& view, int x, int y, Eigen::Vector2f* d_phi, Eigen
 struct Tile {
   cv::Rect rect;
   int band = -1;               ///< -1: no pixel of it has a ray
-  float a_min = 0, a_max = 0;  ///< axis coordinates of its pixels
+  float a_min = 0, a_max = 0;  ///< theta of its pixels [rad]
   std::uint16_t phi_min = 0, phi_max = 0;
-  float h_min = 0, h_max = 0;  ///< hypotheses worth trying
+  float h_min = 0, h_max = 0;  ///< hypotheses worth trying [rad]
   bool clear = false;          ///< every cell it can reach sees the image
 };
 
@@ -112,10 +102,10 @@ struct Tile {
 struct Band {
   double row_scale = 0, row_offset = 0;  ///< row = phi16 * row_scale + row_offset
   double step_phi = 0;                   ///< [rad per row]
-  double step_h = 0;                     ///< hypothesis units per column
+  double step_h = 0;                     ///< [rad per column]
   int rows = 0;
-  /// Cells of row r hold columns [begin[r], begin[r] + 8 * runs[r]); cell index = column +
-  /// origin[r].
+  /// column = theta / step_h. Cells of row r hold columns [begin[r], begin[r] + 8 * runs[r]); cell
+  /// index = column + origin[r].
   std::vector<std::int32_t> begin, runs, origin;
   /// First of the nodes of row r; a row has runs[r] + 1.
   std::vector<std::int32_t> node;
@@ -124,7 +114,6 @@ struct Band {
 /// All bands of one displaced image at one level. A run is eight cells; the image position is
 /// linear between the nodes at its ends.
 struct Grid {
-  double column_scale = 0;  ///< column = a * column_scale(band) = a * column_scale / step_h
   std::vector<Band> bands;
   std::vector<float> x, y;         ///< nodes [px of the reduced displaced image]
   std::vector<std::uint8_t> mask;  ///< by run (cell / 8): bit i set where cell i sees the image
@@ -142,23 +131,21 @@ struct Layout {
 };
 
 struct HypothesisLimits {
-  Axis axis = Axis::kAngle;
-  double baseline = 0;   ///< [m]; kInverse: the longest
+  double baseline = 0;   ///< [m]
   double min_range = 0;  ///< [m]; 0: a parallax of atan(1/4)
   double max_range = 0;  ///< [m]; 0: infinity
   int hypotheses = 0;    ///< most columns; 0: no limit
 };
 
-/// Least and largest hypothesis worth trying at an angle from the baseline.
+/// Least and largest hypothesis [rad] worth trying at an angle theta [rad] from the baseline.
 void hypothesisRange(const HypothesisLimits& limits, double theta, double* least, double* most);
 
 /// Cuts the image into tiles and chooses bands.
 Layout makeLayout(const ReferenceMap& map, const HypothesisLimits& limits, cv::Size tile);
 
 /// Lays out the cells of one displaced image and finds where they lie in it.
-/// @param column_sign_scale +1 for kAngle; 1 / b of the image for kInverse (negative behind)
 Grid makeGrid(Layout* layout, const ReferenceMap& map, const EpipolarFrame& frame,
-              double column_sign_scale, const WideLens& lens, cv::Size full_size, int level,
+              const WideLens& lens, cv::Size full_size, int level,
               const Eigen::Matrix3d& R_ref_disp, int halo, int threads);
 
 }  // namespace omnister::sweep

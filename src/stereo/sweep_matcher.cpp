@@ -90,7 +90,6 @@ class SweepMatcher : public SweepPair {
     const WideLens reference_lens = widen(geometry.reference_lens);
     const WideLens displaced_lens = widen(displaced.lens);
     HypothesisLimits limits;
-    limits.axis = Axis::kAngle;
     limits.baseline = frame_.baseline;
     limits.min_range = options.min_range;
     limits.max_range = std::isfinite(options.max_range) ? options.max_range : 0.0;
@@ -103,11 +102,11 @@ class SweepMatcher : public SweepPair {
     levels_.resize(levels);
     for (int l = 0; l < levels; ++l) {
       Level& level = levels_[l];
-      level.map = makeReferenceMap(reference_lens, geometry.reference_size, l, frame_, limits.axis,
-                                   options.mask, options.threads);
+      level.map = makeReferenceMap(reference_lens, geometry.reference_size, l, frame_, options.mask,
+                                   options.threads);
       level.layout = makeLayout(level.map, limits, cv::Size(kTileWidth, kTileHeight));
-      level.grid = makeGrid(&level.layout, level.map, frame_, 1.0, displaced_lens, displaced.size,
-                            l, displaced.T_ref_disp.linear(), kRadius, options.threads);
+      level.grid = makeGrid(&level.layout, level.map, frame_, displaced_lens, displaced.size, l,
+                            displaced.T_ref_disp.linear(), kRadius, options.threads);
       limits.hypotheses = (limits.hypotheses + 1) / 2;
       level.slack = 2 * kCellSlack;
       for (const Tile& tile : level.layout.tiles) {
@@ -264,7 +263,7 @@ class SweepMatcher : public SweepPair {
     map_job.rows = band.rows;
     map_job.origin = band.origin.data();
     map_job.cells = level.grid.cells;
-    map_job.to_column = static_cast<float>(level.grid.column_scale / band.step_h);
+    map_job.to_column = static_cast<float>(1.0 / band.step_h);
     guessTile(l + 1 < levels_.size() ? &levels_[l + 1].h : nullptr, tile, band, scratch);
     const MapView& view = scratch->view;
     viewMap(level.map,

@@ -33,47 +33,45 @@ TEST(SweepGeometry, InterpolatedMapIsTheLens) {
   for (const double half : {1.2, 1.9}) {
     for (const Eigen::Vector3d& t :
          {Eigen::Vector3d(0.2, 0, 0), Eigen::Vector3d(0.02, -0.01, 0.3)}) {
-      for (const Axis axis : {Axis::kAngle, Axis::kInverse}) {
-        const LensPtr lens = wideLens(size, half);
-        const EpipolarFrame frame = makeEpipolarFrame(t);
-        EXPECT_NEAR((frame.basis * frame.basis.transpose() - Eigen::Matrix3d::Identity()).norm(), 0,
-                    1e-12);
-        const ReferenceMap map = makeReferenceMap(widen(lens), size, 0, frame, axis, cv::Mat(), 2);
-        MapView view;
-        viewMap(map, cv::Rect(-3, -2, size.width + 5, size.height + 7), &view);
-        EXPECT_EQ(view.phi[view.at(-3, 50)], view.phi[view.at(0, 50)]);
-        EXPECT_EQ(view.a[view.at(70, size.height + 4)], view.a[view.at(70, size.height - 1)]);
-        EXPECT_GT(std::count(map.exact.begin(), map.exact.end(), ReferenceMap::kInterpolated), 100);
-        std::size_t field = 0;
-        int checked = 0;
-        for (int y = 0; y < size.height; ++y) {
-          for (int x = 0; x < size.width; ++x) {
-            const std::size_t i = view.at(x, y);
-            field += view.phi[i] != kNoRay;
-            const auto ray = lens->unproject(Eigen::Vector2d(x, y));
-            if (!ray) {
-              EXPECT_EQ(view.phi[i], kNoRay);
-              continue;
-            }
-            const Eigen::Vector3d b = frame.basis * *ray;
-            const double radius = std::hypot(b.y(), b.z());
-            if (radius < 0.03) continue;
-            if (view.phi[i] == kNoRay) {
-              // Only at the very rim may rounding leave a pixel out.
-              EXPECT_GT(std::acos(ray->z()), half - 1e-4);
-              continue;
-            }
-            ++checked;
-            const double theta = std::atan2(radius, b.x());
-            ASSERT_NEAR(thetaOf(axis, view.a[i]), theta, 1e-4) << x << " " << y;
-            double turn = view.phi[i] / kPhiUnits - M_PI - std::atan2(b.z(), b.y());
-            turn -= 2 * M_PI * std::round(turn / (2 * M_PI));
-            ASSERT_NEAR(turn, 0, 2e-4 / radius) << x << " " << y;
+      const LensPtr lens = wideLens(size, half);
+      const EpipolarFrame frame = makeEpipolarFrame(t);
+      EXPECT_NEAR((frame.basis * frame.basis.transpose() - Eigen::Matrix3d::Identity()).norm(), 0,
+                  1e-12);
+      const ReferenceMap map = makeReferenceMap(widen(lens), size, 0, frame, cv::Mat(), 2);
+      MapView view;
+      viewMap(map, cv::Rect(-3, -2, size.width + 5, size.height + 7), &view);
+      EXPECT_EQ(view.phi[view.at(-3, 50)], view.phi[view.at(0, 50)]);
+      EXPECT_EQ(view.a[view.at(70, size.height + 4)], view.a[view.at(70, size.height - 1)]);
+      EXPECT_GT(std::count(map.exact.begin(), map.exact.end(), ReferenceMap::kInterpolated), 100);
+      std::size_t field = 0;
+      int checked = 0;
+      for (int y = 0; y < size.height; ++y) {
+        for (int x = 0; x < size.width; ++x) {
+          const std::size_t i = view.at(x, y);
+          field += view.phi[i] != kNoRay;
+          const auto ray = lens->unproject(Eigen::Vector2d(x, y));
+          if (!ray) {
+            EXPECT_EQ(view.phi[i], kNoRay);
+            continue;
           }
+          const Eigen::Vector3d b = frame.basis * *ray;
+          const double radius = std::hypot(b.y(), b.z());
+          if (radius < 0.03) continue;
+          if (view.phi[i] == kNoRay) {
+            // Only at the very rim may rounding leave a pixel out.
+            EXPECT_GT(std::acos(ray->z()), half - 1e-4);
+            continue;
+          }
+          ++checked;
+          const double theta = std::atan2(radius, b.x());
+          ASSERT_NEAR(view.a[i], theta, 1e-4) << x << " " << y;
+          double turn = view.phi[i] / kPhiUnits - M_PI - std::atan2(b.z(), b.y());
+          turn -= 2 * M_PI * std::round(turn / (2 * M_PI));
+          ASSERT_NEAR(turn, 0, 2e-4 / radius) << x << " " << y;
         }
-        EXPECT_GT(checked, 120000);
-        EXPECT_EQ(field, map.field);
       }
+      EXPECT_GT(checked, 120000);
+      EXPECT_EQ(field, map.field);
     }
   }
 }
@@ -86,11 +84,11 @@ TEST(SweepGeometry, NodesLieWhereTheLensPutsThem) {
   const Eigen::Vector3d t(0.1, 0.02, 0.04);
   const EpipolarFrame frame = makeEpipolarFrame(t);
   const WideLens wide = widen(lens);
-  const ReferenceMap map = makeReferenceMap(wide, size, 0, frame, Axis::kAngle, cv::Mat(), 1);
+  const ReferenceMap map = makeReferenceMap(wide, size, 0, frame, cv::Mat(), 1);
   HypothesisLimits limits;
   limits.baseline = frame.baseline;
   Layout layout = makeLayout(map, limits, cv::Size(64, 48));
-  const Grid grid = makeGrid(&layout, map, frame, 1.0, wide, size, 0, R, kRadius, 2);
+  const Grid grid = makeGrid(&layout, map, frame, wide, size, 0, R, kRadius, 2);
   int checked = 0, seen = 0;
   for (const Band& band : grid.bands) {
     for (int r = 0; r < band.rows; r += 3) {
@@ -129,7 +127,7 @@ TEST(SweepGeometry, NodesLieWhereTheLensPutsThem) {
   EXPECT_GT(seen, 6000);
 }
 
-TEST(SweepGeometry, AxisCoordinatesAreTheLawOfSines) {
+TEST(SweepGeometry, HypothesesAreTheLawOfSines) {
   const double b = 0.3, theta = 1.1, range = 2.3;
   const Eigen::Vector2d point = range * Eigen::Vector2d(std::cos(theta), std::sin(theta));
   const double displaced = std::atan2(point.y(), point.x() - b);
@@ -140,11 +138,6 @@ TEST(SweepGeometry, AxisCoordinatesAreTheLawOfSines) {
   hypothesisRange(limits, theta, &least, &most);
   EXPECT_DOUBLE_EQ(least, 0);
   EXPECT_NEAR(theta + most, displaced, 1e-12);
-  limits.axis = Axis::kInverse;
-  hypothesisRange(limits, theta, &least, &most);
-  EXPECT_NEAR(most, 1 / point.y(), 1e-12);
-  EXPECT_NEAR(axisOf(Axis::kInverse, theta) + b * most, axisOf(Axis::kInverse, displaced), 1e-9);
-  EXPECT_NEAR(thetaOf(Axis::kInverse, axisOf(Axis::kInverse, theta)), theta, 1e-12);
 }
 
 TEST(SweepGeometry, NoBaselineIsRefused) {
