@@ -239,7 +239,7 @@ void holdSimd(const std::string& name);
 /// holdSimd() by OMNISTER_SIMD, the first time it is called.
 void holdSimdByEnvironment();
 
-/// Name of the instruction set in use.
+/// Name of the instruction set in use; tests report it.
 std::string simdName();
 
 }  // namespace omnister::sweep

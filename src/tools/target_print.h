@@ -37,7 +37,7 @@ Layout layOut(const Target& target, const Page& page);
 
 std::string drawPdf(const Layout& layout);
 std::string drawSvg(const Layout& layout);
-/// The same page as a picture, CV_8UC1.
+/// The same page as a picture, CV_8UC1; tests detect the board in it.
 cv::Mat drawImage(const Layout& layout, double pixels_per_mm);
 
 }  // namespace omnister::tools

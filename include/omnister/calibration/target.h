@@ -65,7 +65,7 @@ Eigen::Vector2i targetGrid(const Target& target);
 
 /// Ways to number the points that an image cannot tell apart: `order[k][i]` is the id that point i
 /// has in the k-th of them. The first is the identity; more than one only for checkerboards and
-/// dots whose pattern looks the same when turned by a half or a quarter.
+/// dots whose pattern looks the same when turned by a half or a quarter. An oracle for tests.
 std::vector<std::vector<int>> targetSymmetries(const Target& target);
 
 /// What is printed in black on the board's white, in the board's frame [m]; for drawing.

@@ -21,6 +21,7 @@ namespace omnister {
 
 /// Outside the range of ros::Time (before 1970, after 2106) the nearest end of it.
 ros::Time toRosTime(device::Stamp stamp);
+/// The inverse; tests use it.
 device::Stamp fromRosTime(const ros::Time& stamp);
 
 /// Whether sums and differences with other such stamps are times and durations too: ROS throws

@@ -11,7 +11,7 @@ namespace omnister {
 
 /// Organized cloud on the reference image's grid: x y z [m], rgb (packed as PCL and rviz read it),
 /// sigma [m], score (0 to 1), range along the ray [m], all float32; NaN where invalid (REP 117).
-/// is_dense is false.
+/// is_dense is false. Nodes use fillPointCloud(), which tests compare with this.
 sensor_msgs::PointCloud2Ptr toPointCloud(const Cloud& cloud, const std_msgs::Header& header);
 
 /// The same right from a match, without a cloud between: for a node that is in a hurry.

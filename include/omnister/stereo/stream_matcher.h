@@ -39,7 +39,7 @@ class StreamMatcher {
   MatchResult add(const StereoGeometry::Displaced& camera, const cv::Mat& image);
 
   int frames() const;      ///< that joined since setReference()
-  int framesKept() const;  ///< whose images are held
+  int framesKept() const;  ///< whose images are held; for tests
 
  private:
   struct State;

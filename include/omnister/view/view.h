@@ -54,7 +54,8 @@ ViewGeometry makeViewGeometry(Projection projection, cv::Size size, double hfov,
 /// @return nullopt where the projection has none (beyond the poles)
 std::optional<Eigen::Vector3d> viewRay(const ViewGeometry& geometry, const Eigen::Vector2d& pixel);
 
-/// Where the view shows a direction of the camera's frame; the inverse of viewRay().
+/// Where the view shows a direction of the camera's frame; the inverse of viewRay(). An oracle for
+/// tests.
 /// @return nullopt behind a pinhole view; not clipped to the size
 std::optional<Eigen::Vector2d> viewPixel(const ViewGeometry& geometry, const Eigen::Vector3d& ray);
 
