@@ -35,8 +35,8 @@ int main(int argc, char** argv) {
     const double n = valid > 0 ? static_cast<double>(valid) : 1.0;
     std::string fields;
     for (const auto& field : raw.fields) fields += (fields.empty() ? "" : ",") + field.name;
-    std::printf("%zu %zu %.6f %.6f %.6f %.3f %s\n", cloud.size(), valid, x / n, y / n, z / n, red / n,
-                fields.c_str());
+    std::printf("%zu %zu %.6f %.6f %.6f %.3f %s\n", cloud.size(), valid, x / n, y / n, z / n,
+                red / n, fields.c_str());
   }
   return 0;
 }

@@ -13,9 +13,9 @@ namespace omnister {
 Pose parsePose(std::string_view text, std::string_view source) {
   const auto numbers = parseNumbers(text);
   if (!numbers || numbers->size() != 7) {
-    throw InputError(source, "",
-                     "\"" + printable(text) +
-                         "\" is not a pose, expected 7 numbers \"tx ty tz qx qy qz qw\"");
+    throw InputError(
+        source, "",
+        "\"" + printable(text) + "\" is not a pose, expected 7 numbers \"tx ty tz qx qy qz qw\"");
   }
   const auto& n = *numbers;
   for (double value : n) {

@@ -3,8 +3,8 @@
 
 #include <cmath>
 
-#include "serial_stages.h"
 #include "omnister/common/numbers.h"
+#include "serial_stages.h"
 
 namespace omnister::device {
 

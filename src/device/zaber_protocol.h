@@ -25,10 +25,10 @@ struct ZaberReply {
   int device = 0;
   int axis = 0;
   std::optional<int> id;
-  bool accepted = false;    ///< OK, not RJ
-  bool busy = false;        ///< BUSY, not IDLE
-  std::string warning;      ///< two characters, "--" for none
-  std::string data;         ///< of a rejected command: the reason
+  bool accepted = false;      ///< OK, not RJ
+  bool busy = false;          ///< BUSY, not IDLE
+  std::string warning;        ///< two characters, "--" for none
+  std::string data;           ///< of a rejected command: the reason
   bool has_checksum = false;  ///< and it was right
 };
 

@@ -3,8 +3,8 @@
 
 namespace omnister::tools {
 
-/// Runs `omnister ARGUMENTS…`. @return exit code: 0 done, 1 failed with one message on standard error,
-/// 2 wrong usage
+/// Runs `omnister ARGUMENTS…`. @return exit code: 0 done, 1 failed with one message on standard
+/// error, 2 wrong usage
 int runCommandLine(int argc, const char* const* argv);
 
 }  // namespace omnister::tools

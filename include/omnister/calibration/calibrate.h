@@ -16,23 +16,23 @@
 namespace omnister {
 
 struct CalibrationOptions {
-  std::string model = "auto";         ///< "auto" or a name of lensModelNames()
+  std::string model = "auto";  ///< "auto" or a name of lensModelNames()
   /// Exactly this structure instead of a choice within `model`.
   std::optional<LensStructure> structure;
-  int folds = 0;                      ///< interleaved folds; 0: only what "auto" needs (5)
-  bool board_warp = true;             ///< fit two parameters of board curvature
-  int threads = 0;                    ///< 0: every core
+  int folds = 0;           ///< interleaved folds; 0: only what "auto" needs (5)
+  bool board_warp = true;  ///< fit two parameters of board curvature
+  int threads = 0;         ///< 0: every core
   Progress progress;
 };
 
 /// One view after the fit.
 struct ViewResult {
   std::string name;
-  Pose T_camera_board;                         ///< board to camera, board units
+  Pose T_camera_board;  ///< board to camera, board units
   double rms_px = 0.0;
-  std::vector<Eigen::Vector2d> residuals;      ///< observed - predicted [px]
-  bool used = true;                            ///< false: rejected as a whole
-  std::string reason;                          ///< why it was not used
+  std::vector<Eigen::Vector2d> residuals;  ///< observed - predicted [px]
+  bool used = true;                        ///< false: rejected as a whole
+  std::string reason;                      ///< why it was not used
 };
 
 /// One candidate of the choice among structures.
@@ -63,44 +63,46 @@ struct DepthUncertainty {
 };
 
 struct CalibrationResult {
-  LensFile file;                               ///< lens, covariance and record, ready to write
+  LensFile file;  ///< lens, covariance and record, ready to write
   Eigen::Vector2d board_warp = Eigen::Vector2d::Zero();  ///< see calibrate()
   std::vector<ViewResult> views;
   std::vector<CandidateResult> candidates;
-  double rms_px = 0.0;                         ///< over all corners of used views, 2-D error per corner
+  double rms_px = 0.0;  ///< over all corners of used views, 2-D error per corner
   std::optional<double> holdout_rms_px;
   int points = 0;
-  double height_px = 0.0;        ///< of the surface over its centre, Johnson's R0: pixels per radian there
-  double height_sigma_px = 0.0;  ///< its standard deviation; NaN where it cannot be told
+  double height_px =
+      0.0;  ///< of the surface over its centre, Johnson's R0: pixels per radian there
+  double height_sigma_px = 0.0;     ///< its standard deviation; NaN where it cannot be told
   double uncertainty_rms_px = 0.0;  ///< of directions, over the image (projectionUncertainty())
   double uncertainty_max_px = 0.0;
-  std::vector<DepthUncertainty> depth_uncertainty;  ///< at the boards, 2 and 10 times as far, infinity
+  std::vector<DepthUncertainty>
+      depth_uncertainty;              ///< at the boards, 2 and 10 times as far, infinity
   std::optional<double> bias_rms_px;  ///< difference from the next richer model
   std::string bias_against;           ///< that model
-  std::optional<StageResult> stage;            ///< where views had stage positions
-  std::vector<std::string> warnings;           ///< for a person: bad images by name, poor coverage, …
+  std::optional<StageResult> stage;   ///< where views had stage positions
+  std::vector<std::string> warnings;  ///< for a person: bad images by name, poor coverage, …
 };
 
-/// Joint adjustment of lens, poses and board warp with a robust loss, started from bearings without a
-/// focal guess. Views with a stage position share the pose of their board, moved by the known steps
-/// along an axis that is estimated too; lengths of board and stage are then of one unit.
-/// @throws Error with the reason where the data cannot carry a calibration (too few views, boards only
-/// square to the axis, …). Never returns a failed fit.
+/// Joint adjustment of lens, poses and board warp with a robust loss, started from bearings without
+/// a focal guess. Views with a stage position share the pose of their board, moved by the known
+/// steps along an axis that is estimated too; lengths of board and stage are then of one unit.
+/// @throws Error with the reason where the data cannot carry a calibration (too few views, boards
+/// only square to the axis, …). Never returns a failed fit.
 CalibrationResult calibrate(const Detections& detections, const CalibrationOptions& options);
 
 struct StereoCalibrationResult {
   CalibrationResult left;
   CalibrationResult right;
-  Pose T_left_right;                           ///< maps right (displaced) into left (reference)
-  double rms_px = 0.0;                         ///< joint, over the corners of both cameras
+  Pose T_left_right;    ///< maps right (displaced) into left (reference)
+  double rms_px = 0.0;  ///< joint, over the corners of both cameras
   /// Over pairs unseen by lenses, warp and the pose between the cameras, whose board pose alone was
   /// refitted to both images; where folds were asked for.
   std::optional<double> holdout_rms_px;
   std::vector<std::string> warnings;
 };
 
-/// The same adjustment over two rigidly joined cameras; view i of both saw the board at one instant.
-/// Views are paired by index; a view may be empty where one camera did not see the board.
+/// The same adjustment over two rigidly joined cameras; view i of both saw the board at one
+/// instant. Views are paired by index; a view may be empty where one camera did not see the board.
 StereoCalibrationResult calibrateStereo(const Detections& left, const Detections& right,
                                         const CalibrationOptions& options);
 

@@ -21,15 +21,16 @@ struct StagePosition {
 
 /// One image's corners.
 struct ViewDetections {
-  std::string name{};                       ///< image file or CSV view id, for reports
-  std::vector<Eigen::Vector2d> pixels{};    ///< [px]
-  std::vector<Eigen::Vector3d> points{};    ///< on the board, in the board's unit of length, same order
-  std::optional<StagePosition> stage{};     ///< empty: the board may be anywhere
+  std::string name{};                     ///< image file or CSV view id, for reports
+  std::vector<Eigen::Vector2d> pixels{};  ///< [px]
+  std::vector<Eigen::Vector3d>
+      points{};  ///< on the board, in the board's unit of length, same order
+  std::optional<StagePosition> stage{};  ///< empty: the board may be anywhere
 };
 
 /// All views of one camera, in order of first appearance.
 struct Detections {
-  cv::Size image_size;                     ///< [px]
+  cv::Size image_size;  ///< [px]
   std::vector<ViewDetections> views;
 };
 

@@ -15,11 +15,13 @@ class Error : public std::runtime_error {
   explicit Error(std::string_view message);
 };
 
-/// Bad data: names the source (file, argument, topic), the place in it, and what was expected there.
+/// Bad data: names the source (file, argument, topic), the place in it, and what was expected
+/// there.
 class InputError : public Error {
  public:
   /// @param source file or argument, e.g. "wide.yaml"
-  /// @param place key, line or column inside it, e.g. "lens_surface.center" or "line 12"; may be empty
+  /// @param place key, line or column inside it, e.g. "lens_surface.center" or "line 12"; may be
+  /// empty
   /// @param problem what was found and what was expected, e.g. "is nan, expected a finite number"
   InputError(std::string_view source, std::string_view place, std::string_view problem);
 };

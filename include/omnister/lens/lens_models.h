@@ -28,8 +28,8 @@ struct LensStructure {
   /// s as well: a foreign camera may be turned about its axis against its own image. Never in a
   /// calibration from boards, whose poses would turn along.
   bool turn = false;
-  /// Spline: control points a side (4 to 12) of a smooth 2-D correction of an asphere's rays; 0: the
-  /// radial spline.
+  /// Spline: control points a side (4 to 12) of a smooth 2-D correction of an asphere's rays; 0:
+  /// the radial spline.
   int grid = 0;
 };
 

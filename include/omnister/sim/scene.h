@@ -88,8 +88,8 @@ ScenePtr parseScene(std::string_view text, std::string_view source,
 /// @throws IoError or InputError
 ScenePtr readScene(const std::filesystem::path& path);
 
-/// The scene with one board more, taken from another scene: a board that is carried about is a scene
-/// that lists one board for each pose.
+/// The scene with one board more, taken from another scene: a board that is carried about is a
+/// scene that lists one board for each pose.
 /// @param index into boards.boards()  @throws Error when there is no such board
 ScenePtr withBoard(const Scene& scene, const Scene& boards, std::size_t index);
 

@@ -102,8 +102,8 @@ class View {
   std::vector<Level> levels_;
 };
 
-/// The range image of a camera as depth in a view of it. Ranges are taken from the nearest pixel and
-/// never mixed: between a near and a far one there is nothing.
+/// The range image of a camera as depth in a view of it. Ranges are taken from the nearest pixel
+/// and never mixed: between a near and a far one there is nothing.
 class DepthView {
  public:
   /// As View.
