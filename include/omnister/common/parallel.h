@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/// @file The one place where threads are made: oneTBB under a per-call limit.
+/// @file Parallel computation: oneTBB under a per-call limit.
 #pragma once
 
 #include <tbb/blocked_range.h>
