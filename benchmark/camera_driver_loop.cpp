@@ -17,8 +17,8 @@
 #include <filesystem>
 #include <thread>
 
-#include "omnister/ros/callback_threads.h"
-#include "omnister/ros/camera_driver.h"
+#include "ros/camera/camera_driver.h"
+#include "ros/node/callback_threads.h"
 
 namespace {
 

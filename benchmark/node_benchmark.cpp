@@ -20,9 +20,9 @@
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/stereo_pipeline.h"
 #include "omnister/sim/scene.h"
+#include "ros/message/conversions.h"
+#include "ros/stereo/stereo_pipeline.h"
 #include "stereo_pair.h"
 #include "temporary_folder.h"
 

@@ -4,6 +4,11 @@
 set -euo pipefail
 cd "${1:-$(dirname "$0")/..}"
 
+# What is moved must not leave the checks with nothing to read.
+for folder in src include scripts launch msg srv action cfg; do
+  [ -n "$(find "$folder" -type f 2>/dev/null)" ] || { echo "error: no file to check in $folder" >&2; exit 1; }
+done
+
 status=0
 # refuse WHAT MATCHES: any line of MATCHES is a finding.
 refuse() {
@@ -15,12 +20,12 @@ but() { grep -vE "$1" || true; }
 # The command line becomes doctor_node, by its path beside itself, with the words it was given.
 refuse "starts a program or a shell" "$(grep -rnE \
   '\b(system|popen|fork|vfork|posix_spawnp?|exec[lv]p?e?|dlopen)[[:space:]]*\(|boost[:/]+process|\bsh[" ]+-c' src include |
-  but '^src/tools/doctor_command\.cpp:[0-9]+: *::execv\(doctor\.c_str\(\), argv\.data\(\)\);$|(Bundle|Pose)System system\(')"
-refuse "the demo starts a program by a shell" "$(grep -nE 'shell *= *True|os\.(system|popen)' -r src || true)"
+  but '^src/tools/cli/doctor_command\.cpp:[0-9]+: *::execv\(doctor\.c_str\(\), argv\.data\(\)\);$|(Bundle|Pose)System system\(')"
+refuse "the demo starts a program by a shell" "$(grep -nE 'shell *= *True|os\.(system|popen)' -r scripts || true)"
 
 # What else is read or written by a name goes through file_io.h, contained_path.h or a device.
 refuse "a file is opened beside file_io.h" "$(grep -rnE 'std::ofstream|\bfopen[[:space:]]*\(|cv::imwrite|cv::FileStorage' src include |
-  but '^src/tools/stereo_command\.cpp:[0-9]+: *std::ofstream\("/proc/self/clear_refs"\)')"
+  but '^src/tools/stereo/stereo_command\.cpp:[0-9]+: *std::ofstream\("/proc/self/clear_refs"\)')"
 refuse "executables or folders for everybody" "$(grep -rnE '\bchmod[[:space:]]*\(|\b0777\b|perms::all' src include || true)"
 
 for launch in launch/*.launch; do
@@ -39,7 +44,7 @@ done | grep -E 'string(\[\])? +\w*(device|port|path|file|folder|dir|url|feature|
 refuse "a live parameter names a device or a file" "$(grep -nE "gen\.add\('(\w*(device|port|path|file|folder|url|features?|register|mask)\w*)', *str_t" cfg/*.cfg |
   but "^cfg/Stereo\.cfg:[0-9]+:gen\.add\('mask'")"
 # Writing registers by name is a parameter, and off.
-grep -q 'source.texts("features")' src/ros/camera_driver.cpp || refuse "features comes from elsewhere" src/ros/camera_driver.cpp
+grep -q 'source.texts("features")' src/ros/camera/camera_driver.cpp || refuse "features comes from elsewhere" src/ros/camera/camera_driver.cpp
 refuse "features are written by default" "$(grep -nE '"features"' launch/*.launch | but 'value="\$\(arg features\)"')"
 
 grep -q '^### Security' README.md || refuse "no paragraph on exposing ROS 1 safely" README.md

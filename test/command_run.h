@@ -11,7 +11,7 @@
 #include <utility>
 #include <vector>
 
-#include "tools/command_line.h"
+#include "tools/cli/command_line.h"
 
 namespace omnister::test {
 

@@ -37,7 +37,7 @@ def main():
         return 77
     with tempfile.TemporaryDirectory() as name:
         out = Path(name) / 'out'
-        done = subprocess.run([str(source / 'run'), 'exec', '/usr/bin/python3', str(source / 'src/tools/demo.py'),
+        done = subprocess.run([str(source / 'run'), 'exec', '/usr/bin/python3', str(source / 'scripts/demo.py'),
                                '--headless', '--out', str(out)], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
                               stderr=subprocess.STDOUT, env=dict(os.environ, OMNISTER_BUILD_DIR=str(build)))
         console = done.stdout.decode('utf-8', 'replace')

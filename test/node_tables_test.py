@@ -75,10 +75,17 @@ def compare_numbers(name, getter, headers, default, bounds, complain):
         complain('range of `%s` is %s in the table, %g to %g in the code' % (name, bounds.strip(), *limits))
 
 
+def one_file(source, name):
+    """Text of the file of that name below src/ros."""
+    files = list(source.glob('src/ros/**/' + name))
+    if len(files) != 1:
+        sys.exit('%d files below src/ros are called %s: does this test still read them?' % (len(files), name))
+    return files[0].read_text()
+
+
 def check_section(name, lines, source, complain):
-    code = ''.join((source / 'src/ros' / (unit + '.cpp')).read_text() for unit in SECTIONS[name])
-    headers = ''.join(header.read_text() for unit in SECTIONS[name]
-                      for header in source.glob('include/omnister/ros/%s.h' % unit))
+    code = ''.join(one_file(source, unit + '.cpp') for unit in SECTIONS[name])
+    headers = ''.join(one_file(source, unit + '.h') for unit in SECTIONS[name])
     getters = {getter[1]: getter for getter in GETTER.findall(code)}
     if not getters:
         complain('no parameter was found in the code: does this test still read it?')

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "omnister/device/aravis_camera.h"
+#include "device/camera/aravis/aravis_camera.h"
+#include "device/camera/v4l2/v4l2_camera.h"
 #include "omnister/device/camera.h"
 #include "omnister/device/replay_camera.h"
-#include "omnister/device/v4l2_camera.h"
 
 namespace omnister::device {
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "omnister/device/aravis_camera.h"
+#include "device/camera/aravis/aravis_camera.h"
 
 #include <gmock/gmock.h>
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Every layout of bytes that cameras send, packed here bit by bit after the words of PFNC 2.1 and
 // the GigE Vision standard, beside what the driver makes of it.
-#include "device/pixel_format.h"
+#include "device/camera/pixel_format.h"
 
 #include <gmock/gmock.h>
 #include <linux/videodev2.h>
@@ -12,7 +12,7 @@
 #include <opencv2/imgproc.hpp>
 #include <random>
 
-#include "device/v4l2_format.h"
+#include "device/camera/v4l2/v4l2_format.h"
 
 namespace omnister::device {
 namespace {

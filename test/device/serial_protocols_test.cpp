@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <gtest/gtest.h>
 
-#include "device/grbl_protocol.h"
-#include "device/zaber_protocol.h"
+#include "device/stage/grbl/grbl_protocol.h"
+#include "device/stage/zaber/zaber_protocol.h"
 
 namespace omnister::device {
 namespace {

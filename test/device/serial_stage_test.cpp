@@ -10,7 +10,7 @@
 #include <random>
 #include <thread>
 
-#include "device/serial_port.h"
+#include "device/stage/serial_port.h"
 #include "full_tests.h"
 #include "omnister/device/camera.h"
 #include "omnister/sim/serial_devices.h"

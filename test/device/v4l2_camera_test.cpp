@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Two cameras of the kernel's own test driver, vivid. v4l2_in_qemu.sh beside this file boots a
 // machine that has them, and runs this test there.
-#include "omnister/device/v4l2_camera.h"
+#include "device/camera/v4l2/v4l2_camera.h"
 
 #include <gmock/gmock.h>
 #include <sys/stat.h>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // rosbag itself trusts a bag: none that is taken may lead it out of its memory, or to an end.
 // As all of the ROS layer, before what else there is of ROS.
-#include "omnister/ros/checked_lengths.h"
+#include "ros/node/checked_lengths.h"
 //
 #include <console_bridge/console.h>
 #include <rosbag/bag.h>
@@ -13,7 +13,7 @@
 #include <string>
 
 #include "fuzz.h"
-#include "ros/bag_check.h"
+#include "ros/bag/bag_check.h"
 
 namespace {
 

@@ -2,8 +2,8 @@
 #include <sensor_msgs/CameraInfo.h>
 
 #include "fuzz.h"
-#include "omnister/ros/conversions.h"
-#include "ros/camera_info_reading.h"
+#include "ros/message/camera_info_reading.h"
+#include "ros/message/conversions.h"
 
 void omnister::fuzz::fuzzOne(std::string_view bytes) {
   static const char* const kModels[] = {"plumb_bob", "rational_polynomial", "equidistant",

@@ -2,7 +2,7 @@
 #include <sensor_msgs/PointCloud2.h>
 
 #include "fuzz.h"
-#include "omnister/ros/stereo_messages.h"
+#include "ros/message/stereo_messages.h"
 
 void omnister::fuzz::fuzzOne(std::string_view bytes) {
   Bytes in(bytes);

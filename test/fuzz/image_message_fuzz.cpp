@@ -4,8 +4,8 @@
 #include <boost/make_shared.hpp>
 
 #include "fuzz.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/image_input.h"
+#include "ros/message/conversions.h"
+#include "ros/message/image_input.h"
 
 void omnister::fuzz::fuzzOne(std::string_view bytes) {
   static const char* const kEncodings[] = {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "fuzz.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/messages.h"
+#include "ros/message/conversions.h"
+#include "ros/message/messages.h"
 
 void omnister::fuzz::fuzzOne(std::string_view bytes) {
   Bytes in(bytes);

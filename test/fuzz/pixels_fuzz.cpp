@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <vector>
 
-#include "device/pixel_format.h"
+#include "device/camera/pixel_format.h"
 #include "fuzz.h"
 
 void omnister::fuzz::fuzzOne(std::string_view bytes) {

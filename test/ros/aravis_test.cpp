@@ -14,8 +14,8 @@
 #include <sstream>
 
 #include "child_process.h"
-#include "omnister/ros/camera_driver.h"
 #include "omnister/sim/gige_server.h"
+#include "ros/camera/camera_driver.h"
 #include "ros/ros_test.h"
 #include "temporary_folder.h"
 

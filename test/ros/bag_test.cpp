@@ -12,8 +12,8 @@
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_file.h"
-#include "omnister/ros/messages.h"
 #include "omnister/stereo/cloud.h"
+#include "ros/message/messages.h"
 #include "ros/recorded_rig.h"
 #include "temporary_folder.h"
 

@@ -11,8 +11,8 @@
 #include <functional>
 
 #include "omnister/common/file_io.h"
-#include "omnister/ros/calibration_server.h"
-#include "omnister/ros/conversions.h"
+#include "ros/calibration/calibration_server.h"
+#include "ros/message/conversions.h"
 #include "ros/rig_drivers.h"
 #include "ros/ros_test.h"
 

@@ -18,8 +18,8 @@
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/lens/lens_store.h"
-#include "omnister/ros/camera_driver.h"
-#include "omnister/ros/conversions.h"
+#include "ros/camera/camera_driver.h"
+#include "ros/message/conversions.h"
 #include "ros/ros_test.h"
 #include "temporary_folder.h"
 

@@ -11,7 +11,7 @@
 #include <filesystem>
 #include <iostream>
 
-#include "omnister/ros/conversions.h"
+#include "ros/message/conversions.h"
 #include "unit/stereo/real_data.h"
 
 namespace omnister {

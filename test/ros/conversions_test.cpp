@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "omnister/ros/conversions.h"
+#include "ros/message/conversions.h"
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
@@ -10,8 +10,8 @@
 #include <opencv2/core.hpp>
 
 #include "omnister/lens/lens_models.h"
-#include "omnister/ros/clock_watch.h"
-#include "omnister/ros/image_input.h"
+#include "ros/message/image_input.h"
+#include "ros/node/clock_watch.h"
 
 namespace omnister {
 namespace {

@@ -5,7 +5,7 @@
 #include <functional>
 #include <set>
 
-#include "omnister/ros/doctor.h"
+#include "ros/doctor/doctor.h"
 
 namespace omnister {
 namespace {

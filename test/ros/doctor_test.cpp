@@ -13,10 +13,10 @@
 #include "child_process.h"
 #include "omnister/common/file_io.h"
 #include "omnister/lens/lens_models.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/doctor_facts.h"
-#include "omnister/ros/stereo_pipeline.h"
+#include "ros/doctor/doctor_facts.h"
+#include "ros/message/conversions.h"
 #include "ros/ros_test.h"
+#include "ros/stereo/stereo_pipeline.h"
 #include "temporary_folder.h"
 
 namespace omnister {

@@ -9,10 +9,10 @@
 #include <memory>
 
 #include "omnister/calibration/rig_file.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/stereo_pipeline.h"
+#include "ros/message/conversions.h"
 #include "ros/rendered_views.h"
 #include "ros/ros_test.h"
+#include "ros/stereo/stereo_pipeline.h"
 #include "temporary_folder.h"
 
 namespace omnister {

@@ -224,7 +224,7 @@ class EveryNode(unittest.TestCase):
             self.assertTrue(eventually(lambda: clouds))
 
     def test_1_every_program_is_tried(self):
-        built = re.findall(r'^omnister_add_node\((\w+)\)', (ROOT / 'src/ros/CMakeLists.txt').read_text(), re.M)
+        built = re.findall(r'^omnister_add_node\(\w+ (\w+)\)', (ROOT / 'src/ros/CMakeLists.txt').read_text(), re.M)
         self.assertEqual(sorted(built), sorted(self.programs))
         nodelets = re.findall(r'class name="omnister/(\w+)"', (ROOT / 'nodelet_plugins.xml').read_text())
         come_and_go = (HERE / 'nodes_test.cpp').read_text()

@@ -8,9 +8,9 @@
 #include <set>
 
 #include "child_process.h"
-#include "omnister/ros/stereo_pipeline.h"
 #include "ros/recorded_rig.h"
 #include "ros/ros_test.h"
+#include "ros/stereo/stereo_pipeline.h"
 #include "temporary_folder.h"
 
 namespace omnister {

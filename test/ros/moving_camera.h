@@ -8,7 +8,7 @@
 #include <filesystem>
 #include <string>
 
-#include "omnister/ros/conversions.h"
+#include "ros/message/conversions.h"
 #include "ros/rendered_views.h"
 #include "ros/ros_test.h"
 

@@ -16,8 +16,8 @@
 #include <thread>
 
 #include "omnister/lens/lens_file.h"
-#include "omnister/ros/callback_threads.h"
-#include "omnister/ros/conversions.h"
+#include "ros/message/conversions.h"
+#include "ros/node/callback_threads.h"
 #include "ros/ros_test.h"
 
 namespace omnister {

@@ -7,7 +7,7 @@
 
 #include <filesystem>
 
-#include "omnister/ros/conversions.h"
+#include "ros/message/conversions.h"
 #include "ros/rendered_views.h"
 
 namespace omnister::test {

@@ -3,9 +3,9 @@
 
 #include <memory>
 
-#include "omnister/ros/camera_driver.h"
-#include "omnister/ros/sim_rig.h"
-#include "omnister/ros/stage_driver.h"
+#include "ros/camera/camera_driver.h"
+#include "ros/sim/sim_rig.h"
+#include "ros/stage/stage_driver.h"
 #include "temporary_folder.h"
 
 namespace omnister::test {

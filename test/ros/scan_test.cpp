@@ -7,12 +7,12 @@
 #include "omnister/common/image_file.h"
 #include "omnister/common/image_motion.h"
 #include "omnister/device/replay_camera.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/scan_server.h"
-#include "omnister/ros/stereo_pipeline.h"
+#include "ros/message/conversions.h"
 #include "ros/rendered_views.h"
 #include "ros/rig_drivers.h"
 #include "ros/ros_test.h"
+#include "ros/scan/scan_server.h"
+#include "ros/stereo/stereo_pipeline.h"
 
 namespace omnister {
 namespace {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "omnister/ros/sim_rig.h"
+#include "ros/sim/sim_rig.h"
 
 #include <actionlib/client/simple_action_client.h>
 #include <sensor_msgs/Image.h>
@@ -9,7 +9,7 @@
 #include <opencv2/core.hpp>
 #include <opencv2/imgproc.hpp>
 
-#include "omnister/ros/conversions.h"
+#include "ros/message/conversions.h"
 #include "ros/rig_drivers.h"
 #include "ros/ros_test.h"
 

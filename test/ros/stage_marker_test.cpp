@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "omnister/ros/stage_marker.h"
+#include "ros/stage/stage_marker.h"
 
 #include <gmock/gmock.h>
 #include <visualization_msgs/InteractiveMarkerFeedback.h>
 #include <visualization_msgs/InteractiveMarkerInit.h>
 #include <visualization_msgs/InteractiveMarkerUpdate.h>
 
-#include "omnister/ros/stage_driver.h"
 #include "omnister/sim/simulated_stage.h"
 #include "ros/ros_test.h"
+#include "ros/stage/stage_driver.h"
 
 namespace omnister {
 namespace {

@@ -11,8 +11,8 @@
 
 #include <cmath>
 
-#include "omnister/ros/conversions.h"
 #include "omnister/sim/serial_devices.h"
+#include "ros/message/conversions.h"
 #include "ros/stage_client.h"
 #include "temporary_folder.h"
 

@@ -6,9 +6,9 @@
 #include <algorithm>
 #include <cmath>
 
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/stage_driver.h"
 #include "omnister/sim/simulated_stage.h"
+#include "ros/message/conversions.h"
+#include "ros/stage/stage_driver.h"
 #include "ros/stage_client.h"
 
 namespace omnister {

@@ -23,12 +23,12 @@
 
 #include "omnister/calibration/rig_file.h"
 #include "omnister/lens/lens_models.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/stereo_messages.h"
-#include "omnister/ros/stereo_pipeline.h"
 #include "omnister/sim/renderer.h"
+#include "ros/message/conversions.h"
+#include "ros/message/stereo_messages.h"
 #include "ros/moving_camera.h"
 #include "ros/ros_test.h"
+#include "ros/stereo/stereo_pipeline.h"
 
 namespace omnister {
 namespace {

@@ -11,9 +11,9 @@
 #include <string>
 
 #include "omnister/lens/lens_models.h"
-#include "omnister/ros/conversions.h"
-#include "omnister/ros/view_server.h"
+#include "ros/message/conversions.h"
 #include "ros/ros_test.h"
+#include "ros/view/view_server.h"
 
 namespace omnister {
 namespace {

@@ -9,7 +9,7 @@
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
 #include "synthetic_boards.h"
-#include "tools/command_line.h"
+#include "tools/cli/command_line.h"
 
 namespace omnister {
 namespace {

@@ -13,7 +13,7 @@
 #include "omnister/lens/lens_models.h"
 #include "omnister/stereo/epipolar.h"
 #include "omnister/stereo/matching_limits.h"
-#include "omnister/stereo/triangulation.h"
+#include "stereo/geometry/triangulation.h"
 
 namespace omnister {
 namespace {

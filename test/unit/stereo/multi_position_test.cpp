@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "stereo/multi_position.h"
+#include "stereo/sweep/multi_position.h"
 
 #include <gtest/gtest.h>
 
@@ -14,7 +14,7 @@
 #include "omnister/common/error.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/stereo/stream_matcher.h"
-#include "stereo/joint_refinement.h"
+#include "stereo/sweep/refine/joint_refinement.h"
 
 namespace omnister {
 namespace {

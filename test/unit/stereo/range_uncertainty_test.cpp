@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 /// What calibration leaves unknown, against many calibrations that are wrong by as much.
-#include "stereo/range_uncertainty.h"
+#include "stereo/result/range_uncertainty.h"
 
 #include <gtest/gtest.h>
 
@@ -13,8 +13,8 @@
 #include "analytic_scene.h"
 #include "omnister/common/error.h"
 #include "omnister/lens/lens_models.h"
-#include "omnister/stereo/sweep_matcher.h"
 #include "omnister/stereo/thesis_matcher.h"
+#include "stereo/sweep/sweep_matcher.h"
 
 namespace omnister {
 namespace {

@@ -15,7 +15,7 @@
 #include "omnister/stereo/cloud.h"
 #include "omnister/stereo/matcher.h"
 #include "omnister/stereo/plane_fit.h"
-#include "omnister/stereo/triangulation.h"
+#include "stereo/geometry/triangulation.h"
 
 namespace omnister {
 namespace {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "omnister/stereo/sweep_matcher.h"
+#include "stereo/sweep/sweep_matcher.h"
 
 #include <gtest/gtest.h>
 
@@ -13,7 +13,7 @@
 #include "omnister/common/error.h"
 #include "omnister/lens/lens_models.h"
 #include "omnister/stereo/thesis_matcher.h"
-#include "stereo/sweep_kernels.h"
+#include "stereo/sweep/kernels/kernels.h"
 
 namespace omnister {
 namespace {

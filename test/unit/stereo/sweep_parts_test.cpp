@@ -11,10 +11,10 @@
 
 #include "omnister/common/error.h"
 #include "omnister/lens/lens_models.h"
-#include "stereo/sweep_cost.h"
-#include "stereo/sweep_filters.h"
-#include "stereo/sweep_geometry.h"
-#include "stereo/sweep_kernels.h"
+#include "stereo/sweep/grid/geometry.h"
+#include "stereo/sweep/kernels/kernels.h"
+#include "stereo/sweep/level/cost.h"
+#include "stereo/sweep/refine/filters.h"
 
 namespace omnister::sweep {
 namespace {

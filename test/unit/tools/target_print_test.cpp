@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "tools/target_print.h"
+#include "tools/target/target_print.h"
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
@@ -10,7 +10,7 @@
 
 #include "omnister/calibration/detector.h"
 #include "omnister/common/error.h"
-#include "tools/command_line.h"
+#include "tools/cli/command_line.h"
 
 namespace omnister::tools {
 namespace {
