@@ -17,6 +17,7 @@
 
 #include "omnister/common/pose.h"
 #include "omnister/lens/lens_model.h"
+#include "stereo/sweep/kernels/kernels.h"
 
 namespace omnister::sweep {
 
@@ -36,11 +37,6 @@ struct WideLens {
   double cos_max_theta = -1.0;
 };
 WideLens widen(const LensPtr& lens);
-
-/// Value of ReferenceMap::phi where a pixel has no ray.
-inline constexpr std::uint16_t kNoRay = 0xFFFF;
-/// phi in the units of ReferenceMap::phi per radian; 0 stands for -pi.
-inline constexpr double kPhiUnits = 65534.0 / 6.283185307179586;
 
 /// Epipolar coordinates of every pixel of a (possibly reduced) reference image. They are kept at
 /// the corners of square cells with a cubic between, and pixel by pixel in cells at the edge of the

@@ -38,6 +38,16 @@ inline constexpr int kWindow = 2 * kRadius + 1;
 inline constexpr int kBits = 24;   ///< of a descriptor: 5x5 less the centre
 inline constexpr int kPlanes = 3;  ///< its bytes, each in an array of its own
 
+/// Phi of an epipolar map where a pixel has no ray.
+inline constexpr std::uint16_t kNoRay = 0xFFFF;
+/// Units of phi in such a map per radian; 0 stands for -pi.
+inline constexpr double kPhiUnits = 65534.0 / 6.283185307179586;
+
+/// Costs of correlation are in units of 1 / 2^kCorrelationShift of a bit.
+inline constexpr int kCorrelationShift = 4;
+/// Windows with less than this variance have no correlation [grey levels^2].
+inline constexpr float kLeastVariance = 0.5f;
+
 /// One tile's descriptors, the cells they are compared with, and the window. Arrays by pixel have
 /// `stride` elements a row.
 struct ChunkJob {
@@ -231,6 +241,13 @@ struct TriangulateJob {
 void triangulateRow(TriangulateJob* job);
 
 void matchChunk(const ChunkJob& job);
+
+/// The windows' correlation in place of Hamming distances; reference[0] and cells[0] are grey
+/// values, and costs are (1 - C) / 2 of the window's bits in units of 1 / 2^kCorrelationShift.
+/// @param without_mean whether the windows' means are taken out (ZNCC); else C is eq. 3.1 of
+/// Johnson 1997, which the mean brings near to 1: 1 - C is then brought to the scale of the others
+/// by what it is for windows that have nothing to do with each other, a constant of each pixel
+void correlateChunk(const ChunkJob& job, bool without_mean);
 
 /// Holds the choice to `avx2`, `sse4` or `scalar` at most; `best` lifts that. Not while matching.
 /// @throws Error for another name

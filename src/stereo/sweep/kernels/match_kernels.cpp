@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <cstring>
 
-#include "stereo/sweep/grid/geometry.h"
 #include "stereo/sweep/kernels/kernels.h"
 
 // Highway builds this file once for every instruction set.

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 
-#include "stereo/sweep/grid/geometry.h"
 #include "stereo/sweep/kernels/kernels.h"
 
 // Highway builds this file once for every instruction set.

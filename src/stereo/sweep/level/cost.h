@@ -31,14 +31,4 @@ class CostFunction {
 
 const CostFunction& costFunction(MatchCost cost);
 
-/// The windows' correlation in place of Hamming distances; reference[0] and cells[0] are grey
-/// values, and costs are (1 - C) / 2 of the window's bits in units of 1 / 2^kCorrelationShift.
-/// @param without_mean whether the windows' means are taken out (ZNCC); else C is eq. 3.1 of
-/// Johnson 1997, which the mean brings near to 1: 1 - C is then brought to the scale of the others
-/// by what it is for windows that have nothing to do with each other, a constant of each pixel
-void correlateChunk(const ChunkJob& job, bool without_mean);
-inline constexpr int kCorrelationShift = 4;
-/// Windows with less than this variance have no correlation [grey levels^2].
-inline constexpr float kLeastVariance = 0.5f;
-
 }  // namespace omnister::sweep

@@ -4,11 +4,11 @@
 #include <algorithm>
 #include <cmath>
 
-#include "stereo/sweep/level/cost.h"
+#include "stereo/sweep/kernels/kernels.h"
 
 // Highway builds this file once for every instruction set.
 #undef HWY_TARGET_INCLUDE
-#define HWY_TARGET_INCLUDE "src/stereo/sweep/level/correlation_kernels.cpp"
+#define HWY_TARGET_INCLUDE "src/stereo/sweep/kernels/correlation_kernels.cpp"
 #include <hwy/foreach_target.h>
 #include <hwy/highway.h>
 
