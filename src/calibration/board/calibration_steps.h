@@ -37,18 +37,6 @@ struct Selection {
 Selection selectStructure(const FitInput& input, const Fit& first,
                           const CalibrationOptions& options);
 
-/// Covariance of all that reducedInformation() has columns for, the poses marginalised; its
-/// noise is that of the residuals under the loss of the fit (Huber 1981, sec. 7.6), but at least
-/// `least_sigma_px`.
-Eigen::MatrixXd sharedCovariance(const std::vector<BundleView>& views, const BundleOptions& options,
-                                 const BundleState& state, double loss_px,
-                                 double least_sigma_px = 0.0);
-
-/// Its part that belongs to the lens parameters of camera `camera`.
-Eigen::MatrixXd lensCovariance(const std::vector<BundleView>& views, const BundleOptions& options,
-                               const BundleState& state, double loss_px, int camera,
-                               double least_sigma_px = 0.0);
-
 /// Noise that the question "is the lens determined at all?" assumes, however well the corners fit
 /// [px].
 inline constexpr double kDoubtSigmaPx = 0.05;

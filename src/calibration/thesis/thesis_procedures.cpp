@@ -11,9 +11,9 @@
 #include <opencv2/imgproc.hpp>
 #include <tuple>
 
-#include "calibration/board/calibration_steps.h"
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
+#include "omnister/common/text.h"
 #include "omnister/lens/lens_models.h"
 
 namespace omnister {
