@@ -13,6 +13,4 @@ std::unique_ptr<Matcher> makeMatcher(const std::string& name, const StereoGeomet
   throw Error("unknown matcher '" + printable(name) + "', expected sweep or thesis");
 }
 
-bool Matcher::setPrior(const cv::Mat&) { return false; }
-
 }  // namespace omnister

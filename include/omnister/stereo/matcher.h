@@ -102,7 +102,7 @@ class Matcher {
   /// Another MatcherOptions::prior from now on; may be empty. @return false for a matcher that was
   /// made to take none: the sweep takes one where it refines, and a prior or several displaced
   /// images make it. @throws Error for a prior of another size or type
-  virtual bool setPrior(const cv::Mat& prior);
+  virtual bool setPrior(const cv::Mat& /*prior*/) { return false; }
 };
 
 /// @param name "sweep" or "thesis"
