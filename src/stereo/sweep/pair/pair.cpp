@@ -15,15 +15,12 @@
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"
 #include "omnister/stereo/matching_limits.h"
-#include "stereo/result/range_uncertainty.h"
 #include "stereo/sweep/grid/geometry.h"
 #include "stereo/sweep/kernels/kernels.h"
 #include "stereo/sweep/level/cost.h"
 #include "stereo/sweep/level/level.h"
-#include "stereo/sweep/multi_position.h"
 #include "stereo/sweep/refine/filters.h"
 #include "stereo/sweep/refine/weak_texture.h"
-#include "stereo/sweep/sweep_matcher.h"
 
 namespace omnister {
 namespace {
@@ -653,8 +650,6 @@ class SweepMatcher : public SweepPair {
 
 }  // namespace
 
-namespace {
-
 void checkSweep(const StereoGeometry& geometry, const MatcherOptions& options) {
   checkMatching(geometry, options);
   sweep::holdSimdByEnvironment();
@@ -664,19 +659,6 @@ void checkSweep(const StereoGeometry& geometry, const MatcherOptions& options) {
   for (const auto& displaced : geometry.displaced)
     bytes += 20 * std::max(pixels, static_cast<double>(displaced.size.area()));
   checkMemory(bytes, "the sweep");
-}
-
-}  // namespace
-
-std::unique_ptr<Matcher> makeSweepMatcher(const StereoGeometry& geometry,
-                                          const MatcherOptions& options) {
-  checkSweep(geometry, options);
-  std::unique_ptr<Matcher> matcher;
-  if (geometry.displaced.size() > 1 || options.refine || !options.prior.empty())
-    matcher = makeMultiPositionMatcher(geometry, options);
-  else
-    matcher = std::make_unique<SweepMatcher>(geometry, options);
-  return withCalibrationSigma(std::move(matcher), geometry, options);
 }
 
 std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,

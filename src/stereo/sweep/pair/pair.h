@@ -15,6 +15,10 @@ class SweepPair : public Matcher {
   virtual void takeBuffers(SweepPair* other) = 0;
 };
 
+/// Refuses what no sweep can match, or what would need too much memory.
+/// @throws Error as makeMatcher()
+void checkSweep(const StereoGeometry& geometry, const MatcherOptions& options);
+
 /// @param geometry with one displaced camera
 /// @throws Error as makeMatcher()
 std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,
