@@ -21,19 +21,13 @@
 
 #include "omnister/calibration/detections.h"
 #include "omnister/calibration/feature_tracks.h"
+#include "omnister/calibration/known_angle.h"
 #include "omnister/common/pose.h"
 #include "omnister/common/progress.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/lens/lens_models.h"
 
 namespace omnister {
-
-/// The angle between the rays of two pixels, measured by other means.
-struct KnownAngle {
-  Eigen::Vector2d first = Eigen::Vector2d::Zero();   ///< [px]
-  Eigen::Vector2d second = Eigen::Vector2d::Zero();  ///< [px]
-  double angle = 0.0;                                ///< [rad], in (0, pi)
-};
 
 struct TargetFreeOptions {
   LensStructure structure;  ///< radial; default set by the constructor: asphere to r^6

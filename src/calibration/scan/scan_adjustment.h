@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "omnister/calibration/detections.h"
-#include "omnister/calibration/target_free.h"
+#include "omnister/calibration/known_angle.h"
 #include "omnister/common/pose.h"
 #include "omnister/lens/lens_model.h"
 
