@@ -12,6 +12,7 @@
 #include <string_view>
 
 #include "omnister/lens/lens_model.h"
+#include "omnister/lens/standard_camera_info.h"
 
 namespace omnister {
 
@@ -37,15 +38,6 @@ struct LensFile {
   /// Unit vector of stage travel in the optical frame, where a stage calibration found it.
   std::optional<Eigen::Vector3d> stage_axis;
   CalibrationRecord calibration;
-};
-
-/// The nearest standard ROS model ("equidistant", Kannala and Brandt 2006) of a lens over its
-/// image.
-struct StandardCameraInfo {
-  std::string distortion_model;
-  Eigen::Matrix3d K = Eigen::Matrix3d::Zero();
-  std::vector<double> D;
-  double worst_residual_px = 0.0;  ///< over the image within the field [px]
 };
 
 /// @return nullopt when no standard model comes within 1 px everywhere: then K is to be all zeros

@@ -4,7 +4,8 @@
 #include <opencv2/core/types.hpp>
 #include <optional>
 
-#include "omnister/lens/lens_file.h"
+#include "omnister/lens/lens_model.h"
+#include "omnister/lens/standard_camera_info.h"
 
 namespace omnister::detail {
 

@@ -7,7 +7,7 @@
 #include <string>
 #include <vector>
 
-#include "omnister/lens/lens_file.h"
+#include "omnister/lens/standard_camera_info.h"
 
 namespace omnister::detail {
 
