@@ -12,15 +12,10 @@
 #include <vector>
 
 #include "omnister/common/error.h"
+#include "omnister/common/stamp.h"
 #include "omnister/device/frame_memory.h"
 
 namespace omnister::device {
-
-/// Time since the Unix epoch [ns].
-using Stamp = std::chrono::time_point<std::chrono::system_clock, std::chrono::nanoseconds>;
-
-/// The system's clock as a Stamp.
-Stamp now();
 
 /// Which part of the sensor an image shows, and how coarsely.
 struct SensorRegion {

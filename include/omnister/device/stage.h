@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "omnister/common/error.h"
-#include "omnister/device/camera.h"
+#include "omnister/common/stamp.h"
 
 namespace omnister::device {
 

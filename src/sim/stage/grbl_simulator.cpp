@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <utility>
 
 #include "omnister/common/numbers.h"
 #include "omnister/sim/serial_devices.h"

@@ -9,7 +9,7 @@
 #include "device/stage/serial_port.h"
 #include "device/stage/serial_stage.h"
 #include "omnister/common/numbers.h"
-#include "omnister/device/camera.h"
+#include "omnister/common/stamp.h"
 
 namespace omnister::device {
 namespace {
