@@ -20,7 +20,7 @@ check() {
   done
 }
 
-for layer in common lens calibration stereo view; do
+for layer in common lens calibration stereo view health; do
   check "$ros|$devices" "include/omnister/$layer" "src/$layer"
 done
 for layer in device sim; do

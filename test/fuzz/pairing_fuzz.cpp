@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "fuzz.h"
-#include "ros/stereo/frame_pairing.h"
+#include "stereo/session/frame_pairing.h"
 
 void omnister::fuzz::fuzzOne(std::string_view bytes) {
   Bytes in(bytes);

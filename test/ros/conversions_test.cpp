@@ -9,9 +9,9 @@
 #include <limits>
 #include <opencv2/core.hpp>
 
+#include "health/clock_watch.h"
 #include "omnister/lens/lens_models.h"
 #include "ros/message/image_input.h"
-#include "ros/node/clock_watch.h"
 
 namespace omnister {
 namespace {

@@ -9,6 +9,7 @@
 #include <cstdio>
 #include <limits>
 
+#include "health/diagnostic_pace.h"
 #include "omnister/common/contained_path.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
@@ -18,7 +19,6 @@
 #include "ros/message/conversions.h"
 #include "ros/message/image_input.h"
 #include "ros/node/action_status.h"
-#include "ros/node/diagnostic_pace.h"
 
 template <>
 void actionlib::ActionServer<omnister::CalibrateAction>::publishStatus() {

@@ -19,10 +19,10 @@
 #include <string>
 #include <thread>
 
+#include "calibration/board/board_view_collector.h"
 #include "omnister/calibration/calibrate.h"
 #include "omnister/calibration/detector.h"
 #include "omnister/calibration/target.h"
-#include "ros/calibration/board_view_collector.h"
 #include "ros/message/messages.h"
 #include "ros/node/callback_threads.h"
 #include "ros/node/parameters.h"

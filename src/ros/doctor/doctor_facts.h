@@ -8,7 +8,7 @@
 #include <functional>
 #include <string>
 
-#include "ros/doctor/doctor.h"
+#include "health/doctor.h"
 
 namespace omnister {
 

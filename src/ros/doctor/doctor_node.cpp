@@ -13,9 +13,9 @@
 #include <nlohmann/json.hpp>
 #include <utility>
 
+#include "health/diagnostic_pace.h"
 #include "omnister/common/error.h"
 #include "ros/doctor/doctor_facts.h"
-#include "ros/node/diagnostic_pace.h"
 #include "ros/node/logger_service.h"
 #include "ros/node/run_node.h"
 

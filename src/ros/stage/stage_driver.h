@@ -27,9 +27,9 @@
 #include <string>
 #include <thread>
 
+#include "health/diagnostic_pace.h"
 #include "omnister/device/stage.h"
 #include "ros/node/callback_threads.h"
-#include "ros/node/diagnostic_pace.h"
 #include "ros/stage/external_stage.h"
 
 // See action_status.h; a document of actionlib, not of ours.

@@ -12,6 +12,7 @@
 #include <cmath>
 #include <utility>
 
+#include "health/diagnostic_pace.h"
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
@@ -22,7 +23,6 @@
 #include "ros/message/image_input.h"
 #include "ros/message/lens_markers.h"
 #include "ros/message/stereo_messages.h"
-#include "ros/node/diagnostic_pace.h"
 #include "ros/node/live_parameters.h"
 #include "ros/stereo/stereo_parameters.h"
 

@@ -26,18 +26,18 @@
 #include <thread>
 #include <vector>
 
+#include "health/clock_watch.h"
 #include "omnister/lens/lens_file.h"
 #include "omnister/stereo/matcher.h"
 #include "ros/message/image_input.h"
 #include "ros/message/messages.h"
 #include "ros/message/transform_input.h"
 #include "ros/node/callback_threads.h"
-#include "ros/node/clock_watch.h"
 #include "ros/node/parameters.h"
 #include "ros/stereo/drift_diagnostic.h"
-#include "ros/stereo/frame_pairing.h"
 #include "ros/stereo/stereo_parameters.h"
 #include "ros/stereo/stereo_worker.h"
+#include "stereo/session/frame_pairing.h"
 
 namespace omnister {
 

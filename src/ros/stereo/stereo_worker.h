@@ -16,7 +16,7 @@
 #include "omnister/stereo/cloud.h"
 #include "omnister/stereo/matcher.h"
 #include "omnister/stereo/stream_matcher.h"
-#include "ros/stereo/frame_pairing.h"
+#include "stereo/session/frame_pairing.h"
 
 namespace omnister {
 

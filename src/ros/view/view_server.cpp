@@ -7,10 +7,10 @@
 
 #include <algorithm>
 
+#include "health/diagnostic_pace.h"
 #include "omnister/common/error.h"
 #include "ros/message/conversions.h"
 #include "ros/message/image_input.h"
-#include "ros/node/diagnostic_pace.h"
 #include "ros/node/live_parameters.h"
 
 namespace omnister {

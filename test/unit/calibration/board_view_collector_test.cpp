@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "calibration/board/board_view_collector.h"
+
 #include <gtest/gtest.h>
 
 #include <opencv2/imgproc.hpp>
 
 #include "omnister/common/error.h"
-#include "ros/calibration/board_view_collector.h"
 
 namespace omnister {
 namespace {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "ros/calibration/board_view_collector.h"
+#include "calibration/board/board_view_collector.h"
 
 #include <algorithm>
 #include <cmath>

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // The doctor's judgement, on facts as they are when one thing is broken.
+#include "health/doctor.h"
+
 #include <gmock/gmock.h>
 
 #include <functional>
 #include <set>
-
-#include "ros/doctor/doctor.h"
 
 namespace omnister {
 namespace {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "ros/stereo/frame_pairing.h"
+#include "stereo/session/frame_pairing.h"
 
 #include <algorithm>
 #include <cmath>

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "ros/doctor/doctor.h"
+#include "health/doctor.h"
 
 #include <algorithm>
 #include <cmath>
