@@ -22,6 +22,7 @@
 #include "ros/message/conversions.h"
 #include "ros/message/image_input.h"
 #include "ros/message/messages.h"
+#include "ros/stereo/message_frame.h"
 
 namespace omnister {
 namespace {
@@ -303,7 +304,7 @@ class BagRun {
     PairingFrame frame;
     frame.stamp_ns = static_cast<std::int64_t>(image->header.stamp.toNSec());
     frame.frame_id = image->header.frame_id;
-    frame.image = std::shared_ptr<const void>(image.get(), [image](const void*) {});
+    frame.image = toStereoFrame(image);
     const std::int64_t now = frame.stamp_ns;
     pairing_.add(std::move(frame), now);
     const std::optional<FrameSet> found = pairing_.poll(
@@ -313,8 +314,8 @@ class BagRun {
 
   void matchRig(const sensor_msgs::ImageConstPtr& left, const sensor_msgs::ImageConstPtr& right) {
     StereoSet set;
-    set.reference = left;
-    set.displaced = {right};
+    set.reference = toStereoFrame(left);
+    set.displaced = {toStereoFrame(right)};
     try {
       set.T_ref_disp = {
           T_left_right_ ? *T_left_right_
@@ -331,7 +332,7 @@ class BagRun {
   void match(const StereoSet& set) {
     ++summary_.sets;
     BagCloud result;
-    result.stamp_ns = static_cast<std::int64_t>(set.reference->header.stamp.toNSec());
+    result.stamp_ns = set.reference->stampNs();
     if (!wanted_(result.stamp_ns)) {
       ++summary_.skipped;
       return;
@@ -349,7 +350,7 @@ class BagRun {
     }
     result.seconds =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-    result.frame_id = set.reference->header.frame_id;
+    result.frame_id = messageOf(*set.reference).header.frame_id;
     result.positions = set.displaced.size();
     for (const Pose& pose : set.T_ref_disp)
       result.baseline_m = std::max(result.baseline_m, pose.translation().norm());

@@ -8,8 +8,8 @@
 #include <string>
 
 #include "omnister/common/progress.h"
-#include "ros/stereo/stereo_worker.h"
 #include "stereo/session/frame_pairing.h"
+#include "stereo/session/stereo_worker.h"
 
 namespace omnister {
 

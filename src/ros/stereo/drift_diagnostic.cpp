@@ -5,6 +5,7 @@
 #include <string>
 
 #include "omnister/common/error.h"
+#include "ros/stereo/message_frame.h"
 
 namespace omnister {
 namespace {
@@ -39,8 +40,8 @@ void DriftDiagnostic::look(const StereoSet& set, const PreparedSet& prepared,
   const ros::SteadyTime now = ros::SteadyTime::now();
   if (!last_.isZero() && (now - last_).toSec() < parameters_.period) return;
   last_ = now;
-  monitor_.add(set.reference->header.stamp.toSec(), prepared.geometry, prepared.reference,
-               prepared.displaced.front(), range);
+  monitor_.add(messageOf(*set.reference).header.stamp.toSec(), prepared.geometry,
+               prepared.reference, prepared.displaced.front(), range);
 }
 
 void DriftDiagnostic::diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {

@@ -9,7 +9,7 @@
 
 #include "omnister/stereo/drift_monitor.h"
 #include "ros/node/parameters.h"
-#include "ros/stereo/stereo_worker.h"
+#include "stereo/session/stereo_worker.h"
 
 namespace omnister {
 

@@ -12,8 +12,8 @@
 #include "omnister/stereo/matching_limits.h"
 #include "ros/node/parameters.h"
 #include "ros/stereo/drift_diagnostic.h"
-#include "ros/stereo/stereo_worker.h"
 #include "stereo/session/frame_pairing.h"
+#include "stereo/session/stereo_worker.h"
 
 namespace omnister {
 

@@ -24,6 +24,7 @@
 #include "ros/message/lens_markers.h"
 #include "ros/message/stereo_messages.h"
 #include "ros/node/live_parameters.h"
+#include "ros/stereo/message_frame.h"
 #include "ros/stereo/stereo_parameters.h"
 
 namespace omnister {
@@ -416,7 +417,7 @@ void StereoPipeline::onImage(const sensor_msgs::ImageConstPtr& image) {
   PairingFrame frame;
   frame.stamp_ns = static_cast<std::int64_t>(image->header.stamp.toNSec());
   frame.frame_id = image->header.frame_id;
-  frame.image = std::shared_ptr<const void>(image.get(), [image](const void*) {});
+  frame.image = toStereoFrame(image);
   {
     std::lock_guard<std::mutex> lock(mutex_);
     pairing_.add(std::move(frame), nowNanoseconds());
@@ -436,8 +437,8 @@ void StereoPipeline::onImages(const sensor_msgs::ImageConstPtr& left,
   std::string why;
   const std::optional<Pose> T_left_right = rigPose(*left, *right, &why);
   if (!T_left_right) return drop("no pose", "no pose between the cameras: " + why, true);
-  job.reference = left;
-  job.displaced = {right};
+  job.reference = toStereoFrame(left);
+  job.displaced = {toStereoFrame(right)};
   job.T_ref_disp = {*T_left_right};
   {
     std::lock_guard<std::mutex> lock(mutex_);
@@ -605,14 +606,14 @@ void StereoPipeline::publishOverlay(const MatchedSet& matched, const StereoParam
   geometry.reference_size = matched.grey.size();
   geometry.displaced = {matched.displaced_from};
   if (pixels.empty()) pixels = defaultPixels(geometry.reference_size);
-  const auto picture = [&](const sensor_msgs::Image& image) {
-    return reducedImage(toBgr(image, matched.bits), live.reduce);
+  const auto picture = [&](const StereoFrame& image) {
+    return reducedImage(image.bgr(matched.bits), live.reduce);
   };
   const sensor_msgs::ImagePtr message =
       toImage(drawEpipolarOverlay(picture(*matched.image), picture(*matched.displaced), geometry,
                                   live.matching, matched.result, pixels),
               sensor_msgs::image_encodings::BGR8);
-  message->header = matched.image->header;
+  message->header = messageOf(*matched.image).header;
   epipolar_publisher_.publish(message);
 }
 
@@ -640,7 +641,7 @@ void StereoPipeline::process(const StereoSet& job) {
     last_start_ = start;
     live = live_;
     generation = generation_;
-    reference_frame_ = job.reference->header.frame_id;
+    reference_frame_ = messageOf(*job.reference).header.frame_id;
     for (const Eye& eye : eyes_)
       if (eye.lens) lenses.push_back(*eye.lens);
   }
@@ -655,14 +656,14 @@ void StereoPipeline::process(const StereoSet& job) {
   }
   const PreparedSet prepared =
       worker_.prepare(job, reference_lens, displaced_lens, eyes_.front().topic, eyes_.back().topic);
-  publishLens(job.reference->header.frame_id);
+  publishLens(messageOf(*job.reference).header.frame_id);
   laps.lap("convert");
   if (!live.stream) worker_.matcherFor(prepared.geometry);
   laps.lap("prepare");
   StereoSet placed = job;
   if (parameters_.rig && live.use_prior) {
     // Where the cameras stand, if anybody says; only that takes a prior along.
-    const std_msgs::Header& header = job.reference->header;
+    const std_msgs::Header& header = messageOf(*job.reference).header;
     const PoseAnswer answer =
         cameraPose(header.frame_id, static_cast<std::int64_t>(header.stamp.toNSec()));
     if (answer.state == PoseAnswer::State::kKnown) placed.T_fixed_reference = answer.T_fixed_camera;
@@ -673,7 +674,7 @@ void StereoPipeline::process(const StereoSet& job) {
   const MatchResult& result = matched->result;
   laps.lap("match");
 
-  const std_msgs::Header& header = matched->image->header;
+  const std_msgs::Header& header = messageOf(*matched->image).header;
   if (points_publisher_.getNumSubscribers() > 0) {
     const sensor_msgs::PointCloud2Ptr message = cloudMessage();
     fillPointCloud(result, worker_.rays(*matched), worker_.picture(*matched, true), header,

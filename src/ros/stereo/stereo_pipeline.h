@@ -36,8 +36,8 @@
 #include "ros/node/parameters.h"
 #include "ros/stereo/drift_diagnostic.h"
 #include "ros/stereo/stereo_parameters.h"
-#include "ros/stereo/stereo_worker.h"
 #include "stereo/session/frame_pairing.h"
+#include "stereo/session/stereo_worker.h"
 
 namespace omnister {
 

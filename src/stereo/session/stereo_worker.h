@@ -1,9 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-/// @file From image messages to a cloud, the same for live topics and recordings. Talks to no
-/// master.
+/// @file From images to a cloud, the same for live topics and recordings. Knows no ROS.
 #pragma once
-
-#include <sensor_msgs/Image.h>
 
 #include <list>
 #include <map>
@@ -17,18 +14,19 @@
 #include "omnister/stereo/matcher.h"
 #include "omnister/stereo/stream_matcher.h"
 #include "stereo/session/frame_pairing.h"
+#include "stereo/session/stereo_frame.h"
 
 namespace omnister {
 
 /// What makes one cloud: a reference image and displaced ones, one or more.
 struct StereoSet {
-  sensor_msgs::ImageConstPtr reference;
-  std::vector<sensor_msgs::ImageConstPtr> displaced;
+  StereoFramePtr reference;
+  std::vector<StereoFramePtr> displaced;
   std::vector<Pose> T_ref_disp;           ///< of each displaced image
   std::optional<Pose> T_fixed_reference;  ///< where the reference was taken, if that is known
 };
 
-/// @param set frames whose images are messages
+/// @param set frames whose images are each a StereoFrame
 StereoSet toStereoSet(const FrameSet& set);
 
 struct WorkerSettings {
@@ -50,7 +48,7 @@ struct WorkerSettings {
 /// A set as matchers take it.
 struct PreparedSet {
   StereoGeometry geometry;  ///< of the reduced images
-  int bits = 8;             ///< significant bits of all images, see significantBits()
+  int bits = 8;             ///< significant bits of all images, see StereoFrame
   cv::Mat reference;        ///< CV_8UC1
   std::vector<cv::Mat> displaced;
 };
@@ -58,11 +56,11 @@ struct PreparedSet {
 /// Ranges, and the image on whose pixels they lie: a stream's reference is not the set's.
 struct MatchedSet {
   MatchResult result;
-  sensor_msgs::ImageConstPtr image;
+  StereoFramePtr image;
   cv::Mat grey;                              ///< CV_8UC1, of it, reduced
   int bits = 8;                              ///< of it
   LensPtr lens;                              ///< of the reduced image
-  sensor_msgs::ImageConstPtr displaced;      ///< one that was matched against it,
+  StereoFramePtr displaced;                  ///< one that was matched against it,
   StereoGeometry::Displaced displaced_from;  ///< and its camera
   int positions = 0;                         ///< displaced images that had their say
 };

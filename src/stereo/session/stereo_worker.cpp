@@ -1,7 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "ros/stereo/stereo_worker.h"
-
-#include <sensor_msgs/image_encodings.h>
+#include "stereo/session/stereo_worker.h"
 
 #include <algorithm>
 #include <utility>
@@ -10,7 +8,6 @@
 #include "omnister/lens/reduced_lens.h"
 #include "omnister/stereo/input_region.h"
 #include "omnister/stereo/range_warp.h"
-#include "ros/message/image_input.h"
 
 namespace omnister {
 namespace {
@@ -42,16 +39,14 @@ bool sameGeometry(const StereoGeometry& a, const StereoGeometry& b) {
 }  // namespace
 
 StereoSet toStereoSet(const FrameSet& set) {
-  const auto message = [](const PairingFrame& frame) {
-    const std::shared_ptr<const void> held = frame.image;
-    return sensor_msgs::ImageConstPtr(static_cast<const sensor_msgs::Image*>(held.get()),
-                                      [held](const sensor_msgs::Image*) {});
+  const auto image = [](const PairingFrame& frame) {
+    return std::static_pointer_cast<const StereoFrame>(frame.image);
   };
   StereoSet result;
-  result.reference = message(set.reference);
+  result.reference = image(set.reference);
   result.T_fixed_reference = set.reference.T_fixed_camera;
   for (const FrameSet::Displaced& displaced : set.displaced) {
-    result.displaced.push_back(message(displaced.frame));
+    result.displaced.push_back(image(displaced.frame));
     result.T_ref_disp.push_back(displaced.T_ref_disp);
   }
   return result;
@@ -78,8 +73,8 @@ LensPtr StereoWorker::reducedOnce(const LensPtr& lens) {
 PreparedSet StereoWorker::prepare(const StereoSet& set, const LensFile& reference,
                                   const LensFile& displaced, const std::string& reference_name,
                                   const std::string& displaced_name) {
-  checkFrame(*set.reference, reference.image_size, reference_name);
-  for (const auto& image : set.displaced) checkFrame(*image, displaced.image_size, displaced_name);
+  set.reference->check(reference.image_size, reference_name);
+  for (const auto& image : set.displaced) image->check(displaced.image_size, displaced_name);
   const int factor = settings_.reduce;
   for (const cv::Size size : {reference.image_size, displaced.image_size}) {
     if (factor > 1 && (size.width / factor < 16 || size.height / factor < 16))
@@ -96,12 +91,12 @@ PreparedSet StereoWorker::prepare(const StereoSet& set, const LensFile& referenc
     if (displaced.covariance) prepared.geometry.displaced.back().covariance = *displaced.covariance;
   }
   // 16-bit images of a set are scaled alike.
-  prepared.bits = significantBits(*set.reference);
+  prepared.bits = set.reference->significantBits();
   for (const auto& image : set.displaced)
-    prepared.bits = std::max(prepared.bits, significantBits(*image));
-  prepared.reference = reducedImage(toGray(*set.reference, prepared.bits), factor);
+    prepared.bits = std::max(prepared.bits, image->significantBits());
+  prepared.reference = reducedImage(set.reference->gray(prepared.bits), factor);
   for (const auto& image : set.displaced)
-    prepared.displaced.push_back(reducedImage(toGray(*image, prepared.bits), factor));
+    prepared.displaced.push_back(reducedImage(image->gray(prepared.bits), factor));
   return prepared;
 }
 
@@ -204,8 +199,8 @@ const cv::Mat& StereoWorker::rays(const MatchedSet& matched) {
 
 cv::Mat StereoWorker::picture(const MatchedSet& matched, bool color) const {
   // Colours of a grey image are its grey levels.
-  if (!color || sensor_msgs::image_encodings::isMono(matched.image->encoding)) return matched.grey;
-  return reducedImage(toBgr(*matched.image, matched.bits), settings_.reduce);
+  if (!color || matched.image->isGray()) return matched.grey;
+  return reducedImage(matched.image->bgr(matched.bits), settings_.reduce);
 }
 
 }  // namespace omnister
