@@ -19,7 +19,7 @@ generate_dynamic_reconfigure_options(${OMNISTER_CFG_FILES})
 
 catkin_package(
   INCLUDE_DIRS include
-  LIBRARIES omnister_core omnister_device
+  LIBRARIES omnister_core omnister_device omnister_sim
   CATKIN_DEPENDS actionlib actionlib_msgs cv_bridge diagnostic_msgs dynamic_reconfigure geometry_msgs image_transport
     message_runtime nodelet roscpp sensor_msgs std_msgs std_srvs tf2_ros visualization_msgs)
 
