@@ -1,0 +1,56 @@
+# Layers, as src/layers.txt orders them. The linker refuses calls from one to another that it may not use.
+set(OMNISTER_LAYERS ${PROJECT_SOURCE_DIR}/src/layers.txt)
+set_property(DIRECTORY APPEND PROPERTY CMAKE_CONFIGURE_DEPENDS ${OMNISTER_LAYERS})
+
+# omnister_used_layers(lens result): the layers that rooms of a layer use, without itself.
+function(omnister_used_layers name result)
+  file(STRINGS ${OMNISTER_LAYERS} rooms REGEX "^${name}(/[a-z0-9_/]+)?:")
+  if(NOT rooms)
+    message(FATAL_ERROR "${OMNISTER_LAYERS} has no room of the layer ${name}")
+  endif()
+  set(used)
+  foreach(room ${rooms})
+    string(REGEX REPLACE "^[^:]*:" "" words "${room}")
+    string(REGEX MATCHALL "[a-z0-9_/]+" words "${words}")
+    foreach(word ${words})
+      string(REGEX REPLACE "/.*" "" layer ${word})
+      list(APPEND used ${layer})
+    endforeach()
+  endforeach()
+  list(REMOVE_DUPLICATES used)
+  list(REMOVE_ITEM used ${name})
+  set(${result} ${used} PARENT_SCOPE)
+endfunction()
+
+# Symbols that no library defines fail the link of a shared library, not that of the programs that use it. The runtime
+# libraries of sanitizers are only linked into programs.
+function(omnister_refuse_undefined target)
+  if(NOT OMNISTER_SANITIZE AND NOT OMNISTER_FUZZ)
+    target_link_options(${target} PRIVATE LINKER:-z,defs)
+  endif()
+endfunction()
+
+# omnister_add_layer(NAME LIBRARIES … SOURCES …): a layer of omnister_core. Users link omnister_core, which is all of
+# them. omnister_NAME_layer, which is linked with the layers below alone, is there for the linker to check.
+function(omnister_add_layer name)
+  cmake_parse_arguments(PARSE_ARGV 1 LAYER "" "" "LIBRARIES;SOURCES")
+  add_library(omnister_${name} OBJECT ${LAYER_SOURCES})
+  target_link_libraries(omnister_${name} PUBLIC omnister_headers PRIVATE ${LAYER_LIBRARIES})
+  target_sources(omnister_core PRIVATE $<TARGET_OBJECTS:omnister_${name}>)
+  target_link_libraries(omnister_core PRIVATE ${LAYER_LIBRARIES})
+  if(OMNISTER_SANITIZE OR OMNISTER_FUZZ)
+    return()
+  endif()
+  add_library(omnister_${name}_layer SHARED $<TARGET_OBJECTS:omnister_${name}>)
+  set_target_properties(omnister_${name}_layer PROPERTIES
+    LINKER_LANGUAGE CXX LIBRARY_OUTPUT_DIRECTORY ${CMAKE_BINARY_DIR}/layers)
+  target_link_libraries(omnister_${name}_layer PRIVATE omnister_headers ${LAYER_LIBRARIES})
+  omnister_used_layers(${name} below)
+  foreach(layer ${below})
+    if(NOT TARGET omnister_${layer}_layer)
+      message(FATAL_ERROR "src/layers.txt: ${name} uses ${layer}, which is no layer of omnister_core below it")
+    endif()
+    target_link_libraries(omnister_${name}_layer PRIVATE omnister_${layer}_layer)
+  endforeach()
+  omnister_refuse_undefined(omnister_${name}_layer)
+endfunction()
