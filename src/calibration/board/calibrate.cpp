@@ -7,7 +7,7 @@
 
 #include "calibration/board/calibration_steps.h"
 #include "calibration/board/stage_views.h"
-#include "calibration/fit/covariance.h"
+#include "calibration/uncertainty/covariance.h"
 #include "omnister/calibration/uncertainty.h"
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"

@@ -7,7 +7,7 @@
 #include <map>
 
 #include "calibration/board/calibration_steps.h"
-#include "calibration/fit/covariance.h"
+#include "calibration/uncertainty/covariance.h"
 #include "omnister/calibration/uncertainty.h"
 #include "omnister/common/error.h"
 #include "omnister/common/parallel.h"

@@ -6,7 +6,7 @@
 #include <map>
 #include <tuple>
 
-#include "calibration/fit/covariance.h"
+#include "calibration/uncertainty/covariance.h"
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "calibration/fit/covariance.h"
+#include "calibration/uncertainty/covariance.h"
 
 #include <Eigen/Eigenvalues>
 #include <algorithm>
