@@ -15,7 +15,7 @@ import xmlrpc.client
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / 'src' / 'tools')]
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / 'scripts')]
 import demo  # noqa: E402  (its processes, its clock and its hands on the rig)
 import foreign_camera  # noqa: E402
 
