@@ -35,7 +35,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 # catkin keeps the environment of the time of configuring, when a clean tree has no messages yet: they lie beside the nodes.
 LIBRARIES = Path(roslib.packages.find_node('omnister', 'stage_node')[0]).resolve().parents[1]
-sys.path[:0] = [str(ROOT / 'src' / 'tools'), str(ROOT / 'test' / 'rig'), str(LIBRARIES / 'python3' / 'dist-packages')]
+sys.path[:0] = [str(ROOT / 'scripts'), str(ROOT / 'test' / 'rig'), str(LIBRARIES / 'python3' / 'dist-packages')]
 import demo  # noqa: E402  (its hands on a rig: services and actions)
 
 PATIENCE = 60.0  # until something is said never to happen [s]; no measure of speed
