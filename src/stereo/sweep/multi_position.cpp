@@ -166,7 +166,9 @@ class MultiPositionMatcher : public Matcher {
     for (const std::size_t i : order_) {
       StereoGeometry pair = geometry;
       pair.displaced = {geometry.displaced[i]};
-      pairs_.push_back(makeSweepPair(pair, common));
+      pairs_.push_back(makeSweepPair(
+          pair, common,
+          geometry.displaced.size() > 1 ? PairChecks::kStrict : PairChecks::kByTexture));
       if (pairs_.size() > 1) pairs_.back()->takeBuffers(pairs_[pairs_.size() - 2].get());
     }
   }

@@ -89,7 +89,7 @@ MatchResult StreamMatcher::add(const StereoGeometry::Displaced& camera, const cv
   geometry.displaced = {camera};
   checkMatching(geometry, state.options);
   checkImages(geometry, state.reference, {image});
-  auto pair = makeSweepPair(geometry, state.options);
+  auto pair = makeSweepPair(geometry, state.options, PairChecks::kStrict);
   if (state.pair) pair->takeBuffers(state.pair.get());
   state.pair = std::move(pair);
   MatchResult result = state.pair->match(state.reference, {image});

@@ -30,7 +30,7 @@ struct Own {
   float slope = 0;      ///< cost = cost_at_0 - slope * (covariance or sum of products) / root
 };
 
-template <int kLanes, bool kFirst, bool kWithoutMean>
+template <int kLanes, bool kWithoutMean>
 void CorrelateLanes(const ChunkJob& job) {
   constexpr int kAhead = 3;  // rows
   const int width = job.width, height = job.height, stride = job.stride;
@@ -39,6 +39,7 @@ void CorrelateLanes(const ChunkJob& job) {
   const hn::CappedTag<std::int32_t, std::min(kLanes, 16)> d;
   const hn::RebindToFloat<decltype(d)> df;
   const hn::Rebind<std::uint8_t, decltype(d)> d8;
+  const hn::Rebind<std::uint16_t, decltype(d)> d16;
   constexpr std::size_t n = hn::MaxLanes(decltype(d)());
   // Sums down the columns of windows: of the displaced image's grey values, of their squares, and
   // of their products with the reference's; then costs of a row of pixels.
@@ -111,7 +112,7 @@ void CorrelateLanes(const ChunkJob& job) {
       }
       return own;
     };
-    const std::size_t out_row = static_cast<std::size_t>(y - kWindow + 1) * tile_width;
+    std::uint16_t* HWY_RESTRICT volume = job.volume + (y - kWindow + 1) * job.row_stride;
     const auto count = hn::Set(d, kCount);
     for (std::size_t l = 0; l < kLanes; l += n) {
       auto sum = hn::Zero(d), square = hn::Zero(d), product = hn::Zero(d);
@@ -149,40 +150,20 @@ void CorrelateLanes(const ChunkJob& job) {
         product = hn::Sub(product, hn::LoadU(d, products + first));
       }
     }
-    HWY_ALIGN std::int32_t packed[HWY_MAX_BYTES / 4];
-    for (int x = 0; x < tile_width; ++x) {
-      const std::int32_t* HWY_RESTRICT of_pixel = costs + static_cast<std::size_t>(x) * kLanes;
-      auto least = hn::Set(d, 0x7FFFFFFF);
-      for (std::size_t l = 0; l < kLanes; l += n) {
-        const auto lane = hn::Add(hn::Iota(d, 0), hn::Set(d, static_cast<std::int32_t>(l)));
-        const auto inner = hn::And(hn::Gt(lane, hn::Zero(d)), hn::Lt(lane, hn::Set(d, kLanes - 1)));
-        const auto cost = hn::Or(hn::ShiftLeft<5>(hn::LoadU(d, of_pixel + l)), lane);
-        least = hn::Min(least, hn::IfThenElse(inner, cost, hn::Set(d, 0x7FFFFFFF)));
-      }
-      hn::Store(least, d, packed);
-      const std::int32_t best = *std::min_element(packed, packed + n);
-      const auto cost = static_cast<std::uint16_t>(best >> 5);
-      const std::size_t at = out_row + x;
-      if (!kFirst && cost >= job.cost[at]) continue;
-      const int lane = best & 31;
-      job.cost[at] = cost;
-      job.index[at] = static_cast<std::int16_t>(job.first + lane);
-      job.before[at] = static_cast<std::uint16_t>(of_pixel[lane - 1]);
-      job.after[at] = static_cast<std::uint16_t>(of_pixel[lane + 1]);
-    }
+    for (int x = 0; x < tile_width; ++x)
+      for (std::size_t l = 0; l < kLanes; l += n)
+        hn::StoreU(
+            hn::DemoteTo(d16, hn::LoadU(d, costs + static_cast<std::size_t>(x) * kLanes + l)), d16,
+            volume + x * job.pixel_stride + l);
   }
 }
 
 template <bool kWithoutMean>
 void CorrelateAny(const ChunkJob& job) {
-  if (job.lanes == 16 && job.fresh)
-    CorrelateLanes<16, true, kWithoutMean>(job);
-  else if (job.lanes == 16)
-    CorrelateLanes<16, false, kWithoutMean>(job);
-  else if (job.fresh)
-    CorrelateLanes<32, true, kWithoutMean>(job);
+  if (job.lanes == 16)
+    CorrelateLanes<16, kWithoutMean>(job);
   else
-    CorrelateLanes<32, false, kWithoutMean>(job);
+    CorrelateLanes<32, kWithoutMean>(job);
 }
 
 void CorrelateChunk(const ChunkJob& job, bool without_mean) {

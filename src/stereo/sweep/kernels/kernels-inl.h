@@ -23,6 +23,27 @@ HWY_INLINE hn::Vec<D> Count(D d, int x) {
                                                         8, 9, 10, 11, 12, 13, 14, 15};
   return hn::Add(hn::Load(d, kFirst), hn::Set(d, x));
 }
+/// Least lane of a vector of at most 32.
+template <class D, class V>
+HWY_INLINE std::uint16_t LeastLane(D d, V v) {
+#if HWY_TARGET == HWY_SCALAR
+  static_cast<void>(d);
+  return hn::GetLane(v);
+#else
+  if constexpr (hn::MaxLanes(D()) > 8) {
+    const hn::Half<D> half;
+    return LeastLane(half, hn::Min(hn::LowerHalf(half, v), hn::UpperHalf(half, v)));
+  } else {
+#if HWY_TARGET <= HWY_SSE4 && HWY_ARCH_X86
+    static_cast<void>(d);
+    return static_cast<std::uint16_t>(_mm_cvtsi128_si32(_mm_minpos_epu16(v.raw)));
+#else
+    return hn::GetLane(hn::MinOfLanes(d, v));
+#endif
+  }
+#endif
+}
+
 // Polynomials in place of the library's functions: the same bits whatever the instruction set.
 
 /// Sine on [0, pi], to 1e-7.

@@ -48,23 +48,21 @@ inline constexpr int kCorrelationShift = 4;
 /// Windows with less than this variance have no correlation [grey levels^2].
 inline constexpr float kLeastVariance = 0.5f;
 
-/// One tile's descriptors, the cells they are compared with, and the window. Arrays by pixel have
-/// `stride` elements a row.
+/// One tile's descriptors, the cells they are compared with, and where costs go. Arrays by pixel
+/// have `stride` elements a row.
 struct ChunkJob {
   int width = 0, height = 0;  ///< of the tile with its halo of kRadius
   int stride = 0;
-  int lanes = 32;  ///< hypotheses tried: 16 or 32; the outer two only serve as neighbours
+  int lanes = 32;                      ///< hypotheses tried: 16 or 32
   const std::int32_t* base = nullptr;  ///< cell of hypothesis 0, by pixel
-  int first = 0;       ///< hypothesis of lane 0; cells from base + first on must be readable
-  bool fresh = false;  ///< nothing was tried before: the state is written without a look
+  int first = 0;  ///< hypothesis of lane 0; cells from base + first on must be readable
   const std::uint8_t* reference[kPlanes] = {};
   const std::uint8_t* cells[kPlanes] = {};
-  /// State by pixel of the tile without halo, `width - 2 kRadius` a row; a chunk replaces it where
-  /// it finds a lower cost.
-  std::uint16_t* cost = nullptr;  ///< 0xFFFF at first
-  std::int16_t* index = nullptr;
-  std::uint16_t* before = nullptr;  ///< costs of the neighbouring hypotheses
-  std::uint16_t* after = nullptr;
+  /// [out] cost of lane 0 of the first pixel without halo; lanes lie side by side.
+  std::uint16_t* volume = nullptr;
+  std::ptrdiff_t pixel_stride = 0, row_stride = 0;  ///< of the volume
+  /// [out] likewise, of the pixel and its eight neighbours alone; may be null.
+  std::uint8_t* near = nullptr;
   std::vector<std::uint8_t>* scratch = nullptr;
 };
 
@@ -159,6 +157,8 @@ struct ConcludeJob {
   float step_h = 0;
   float guess = 0, guess_x = 0;  ///< as in MapJob, from the row's first pixel
   float worst_cost = 0;          ///< in the units of costs
+  /// Whether a hypothesis need not cost less than those beside it: paths chose it.
+  bool chosen = false;
   /// Costs near the least are a parabola. `steep` is then what gives TriangulateJob the spread of
   /// such a least: it goes with the root of the rise.
   bool parabola = false;
@@ -198,13 +198,17 @@ struct RejectJob {
   const float* h[3] = {};           ///< rows y - kReach, y, y + kReach
   /// The same; kReach elements before and behind must be readable.
   const std::uint16_t* cost[3] = {};
-  float jump = 0;        ///< hypotheses that differ by more lie on two surfaces
-  float* out = nullptr;  ///< h, with NaN for what goes
+  float jump = 0;  ///< hypotheses that differ by more lie on two surfaces
+  /// Whether both tests are strict, by tile of the row, each `tile_width` pixels wide, a multiple
+  /// of any vector's lanes.
+  const std::uint8_t* strict = nullptr;
+  int tile_width = 64;
+  float* out = nullptr;                       ///< h, with NaN for what goes
   std::size_t found = 0, lost = 0, edge = 0;  ///< counted up: matches, and those that went
 };
-/// Leaves out matches whose spot went to another hypothesis; and at the edge of a nearer surface
-/// those that cost much more than that surface does further in: they lie beyond the edge, in the
-/// reach of windows across it.
+/// Leaves out matches whose spot, and unless strict also the spots beside it, went to another
+/// hypothesis; and in strict tiles at the edge of a nearer surface those that cost much more than
+/// that surface does further in: they lie beyond the edge, in the reach of windows across it.
 void rejectRow(RejectJob* job);
 
 /// Rows that averageRow() looks at. Errors of neighbours are alike, for they share most of their
@@ -219,6 +223,9 @@ void averageRow(const float* const rows[kAverageRows], int count, float near, fl
 /// Spread of a hypothesis [columns] times the slope of its cost over the root of the cost; as
 /// measured on rendered scenes with image noise of one grey level.
 inline constexpr float kSigmaOfCost = 0.44f;
+/// The same, and the least spread [columns], where windows alone are not sure; as measured on pairs
+/// with known depth and on rooms rendered with photographs.
+inline constexpr float kSigmaOfDoubt = 0.8f, kLeastSpread = 0.05f, kLeastOfDoubt = 0.13f;
 /// Of the root of the rise of a parabola, so that kSigmaOfCost holds for it as well.
 inline constexpr float kSteepOfParabola = 0.77f;
 
@@ -233,6 +240,9 @@ struct TriangulateJob {
   float step_h = 0;
   float min_range = 0, max_range = 0;
   float full_cost = 0;  ///< of a match that is worth nothing
+  /// Whether windows alone are sure, by tile of the row; null: they are.
+  const std::uint8_t* sure = nullptr;
+  int tile_width = 64;
   float* range = nullptr;
   float* sigma = nullptr;
   float* score = nullptr;

@@ -19,27 +19,6 @@ namespace omnister::sweep {
 namespace HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-/// Least lane of a vector of at most 32.
-template <class D, class V>
-HWY_INLINE std::uint16_t LeastLane(D d, V v) {
-#if HWY_TARGET == HWY_SCALAR
-  static_cast<void>(d);
-  return hn::GetLane(v);
-#else
-  if constexpr (hn::MaxLanes(D()) > 8) {
-    const hn::Half<D> half;
-    return LeastLane(half, hn::Min(hn::LowerHalf(half, v), hn::UpperHalf(half, v)));
-  } else {
-#if HWY_TARGET <= HWY_SSE4 && HWY_ARCH_X86
-    static_cast<void>(d);
-    return static_cast<std::uint16_t>(_mm_cvtsi128_si32(_mm_minpos_epu16(v.raw)));
-#else
-    return hn::GetLane(hn::MinOfLanes(d, v));
-#endif
-  }
-#endif
-}
-
 /// A vector of two halves that lie apart. @param d of more than one lane
 template <class D>
 HWY_INLINE hn::Vec<D> LoadHalves(D d, const std::uint8_t* low, const std::uint8_t* high) {
@@ -52,9 +31,8 @@ HWY_INLINE hn::Vec<D> LoadHalves(D d, const std::uint8_t* low, const std::uint8_
 #endif
 }
 
-template <int kLanes, bool kFirst>
+template <int kLanes>
 void MatchLanes(const ChunkJob& job) {
-  constexpr int kRowWidth = 128;
   constexpr int kAhead = 3;  // rows
   const int width = job.width, height = job.height, stride = job.stride;
   const int tile_width = width - 2 * kRadius;
@@ -78,16 +56,12 @@ void MatchLanes(const ChunkJob& job) {
                                                        0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1,
                                                        1, 1, 1, 1, 1, 1, 1, 1, 1, 1};
   const hn::CappedTag<std::uint8_t, kLanes * kPixels> d8;
+  const hn::CappedTag<std::uint8_t, kLanes> d8l;
+  constexpr std::size_t n8l = hn::MaxLanes(decltype(d8l)());
   const hn::CappedTag<std::uint16_t, kLanes> d16;
   const hn::Rebind<std::uint8_t, decltype(d16)> d8h;
   constexpr std::size_t n8 = hn::MaxLanes(decltype(d8)());
   constexpr std::size_t n16 = hn::MaxLanes(decltype(d16)());
-  HWY_ALIGN std::uint16_t lane_index[kLanes];
-  for (int i = 0; i < kLanes; ++i)
-    lane_index[i] = (i == 0 || i == kLanes - 1) ? 0xFFFF : static_cast<std::uint16_t>(i);
-
-  HWY_ALIGN std::uint16_t boxes[kRowWidth * kLanes];
-  HWY_ALIGN std::uint16_t packed[kRowWidth];
   for (int y = 0; y < height; ++y) {
     std::uint8_t* HWY_RESTRICT old = ring + static_cast<std::size_t>(y % kWindow) * line;
     const std::size_t row = static_cast<std::size_t>(y) * stride;
@@ -138,47 +112,50 @@ void MatchLanes(const ChunkJob& job) {
       }
     }
     if (y < kWindow - 1) continue;
+    std::uint16_t* HWY_RESTRICT out = job.volume + (y - kWindow + 1) * job.row_stride;
+    if (job.near) {
+      // The middle three of the window's rows, then of its columns.
+      const auto ringRow = [&](int back) {
+        return ring + static_cast<std::size_t>((y - back) % kWindow) * line;
+      };
+      const std::uint8_t* HWY_RESTRICT above = ringRow(kRadius + 1);
+      const std::uint8_t* HWY_RESTRICT here = ringRow(kRadius);
+      const std::uint8_t* HWY_RESTRICT below = ringRow(kRadius - 1);
+      std::uint8_t* HWY_RESTRICT near = job.near + (y - kWindow + 1) * job.row_stride;
+      for (std::size_t l = 0; l < kLanes; l += n8l) {
+        const auto column = [&](int x) {
+          const std::size_t at = static_cast<std::size_t>(x) * kLanes + l;
+          return hn::Add(hn::Add(hn::LoadU(d8l, above + at), hn::LoadU(d8l, here + at)),
+                         hn::LoadU(d8l, below + at));
+        };
+        auto left = column(kRadius - 1), middle = column(kRadius);
+        for (int x = 0; x < tile_width; ++x) {
+          const auto right = column(x + kRadius + 1);
+          hn::StoreU(hn::Add(hn::Add(left, middle), right), d8l, near + x * job.pixel_stride + l);
+          left = middle;
+          middle = right;
+        }
+      }
+    }
     for (std::size_t l = 0; l < kLanes; l += n16) {
-      const auto index = hn::Load(d16, lane_index + l);
       auto sum = hn::Zero(d16);
       for (int x = 0; x < kWindow - 1; ++x)
         sum = hn::Add(sum, hn::PromoteTo(d16, hn::LoadU(d8h, sums + x * kLanes + l)));
       for (int x = 0; x < tile_width; ++x) {
         const std::uint8_t* HWY_RESTRICT gone = sums + static_cast<std::size_t>(x) * kLanes + l;
         sum = hn::Add(sum, hn::PromoteTo(d16, hn::LoadU(d8h, gone + (kWindow - 1) * kLanes)));
-        hn::Store(sum, d16, boxes + static_cast<std::size_t>(x) * kLanes + l);
-        const std::uint16_t least = LeastLane(d16, hn::Or(hn::ShiftLeft<5>(sum), index));
-        packed[x] = l == 0 ? least : std::min(packed[x], least);
+        hn::StoreU(sum, d16, out + x * job.pixel_stride + l);
         sum = hn::Sub(sum, hn::PromoteTo(d16, hn::LoadU(d8h, gone)));
       }
-    }
-    const std::size_t out = static_cast<std::size_t>(y - kWindow + 1) * tile_width;
-    std::uint16_t* HWY_RESTRICT cost = job.cost + out;
-    std::int16_t* HWY_RESTRICT index = job.index + out;
-    std::uint16_t* HWY_RESTRICT before = job.before + out;
-    std::uint16_t* HWY_RESTRICT after = job.after + out;
-    const int first = job.first;
-    for (int x = 0; x < tile_width; ++x) {
-      const std::uint16_t c = packed[x] >> 5;
-      if (!kFirst && c >= cost[x]) continue;
-      const int lane = packed[x] & 31;
-      cost[x] = c;
-      index[x] = static_cast<std::int16_t>(first + lane);
-      before[x] = boxes[x * kLanes + lane - 1];
-      after[x] = boxes[x * kLanes + lane + 1];
     }
   }
 }
 
 void MatchChunk(const ChunkJob& job) {
-  if (job.lanes == 16 && job.fresh)
-    MatchLanes<16, true>(job);
-  else if (job.lanes == 16)
-    MatchLanes<16, false>(job);
-  else if (job.fresh)
-    MatchLanes<32, true>(job);
+  if (job.lanes == 16)
+    MatchLanes<16>(job);
   else
-    MatchLanes<32, false>(job);
+    MatchLanes<32>(job);
 }
 
 void MapCells(const MapCellsJob& job) {

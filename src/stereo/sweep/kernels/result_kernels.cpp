@@ -53,16 +53,22 @@ void ConcludeRow(ConcludeJob* in_out) {
           hn::And(hn::Shr(hn::Load(di, words), hn::And(safe, hn::Set(di, 7))), hn::Set(di, 1));
       good = hn::And(good, hn::And(legal, hn::Eq(bit, hn::Set(di, 1))));
     }
-    auto fine = hn::And(hn::RebindMask(df, good), hn::Gt(steep, hn::Zero(df)));
-    // The least at the end of an interval is the foot of one beyond it.
-    fine = hn::And(fine, hn::And(hn::Ge(before, c), hn::Ge(after, c)));
+    auto fine = hn::RebindMask(df, good);
     fine = hn::And(fine, hn::Le(c, hn::Set(df, job.worst_cost)));
+    if (!job.chosen) {
+      fine = hn::And(fine, hn::Gt(steep, hn::Zero(df)));
+      // The least at the end of an interval is the foot of one beyond it.
+      fine = hn::And(fine, hn::And(hn::Ge(before, c), hn::Ge(after, c)));
+    }
     // The pixels of a window fall between columns, each elsewhere: their sum is rounder than two
     // lines and sharper than a parabola. With this gain a shift of all columns leaves no bias.
     constexpr float kGain = 0.62f, kParabola = 0.5f;
-    const auto shift =
+    const auto bend =
         hn::Div(hn::Mul(hn::Sub(before, after), hn::Set(df, job.parabola ? kParabola : kGain)),
                 hn::Max(hn::Sub(hn::Add(before, after), hn::Add(c, c)), hn::Set(df, 1.0f)));
+    // Beyond that where the middle is not the least.
+    constexpr float kMost = 0.62f;
+    const auto shift = hn::Min(hn::Max(bend, hn::Set(df, -kMost)), hn::Set(df, kMost));
     const auto guess = hn::Add(hn::Mul(hn::ConvertTo(df, Count(di, x)), hn::Set(df, job.guess_x)),
                                hn::Set(df, job.guess));
     const auto columns =
@@ -148,7 +154,7 @@ void RejectRow(RejectJob* in_out) {
     return hn::PromoteTo(di, hn::LoadU(du16, job.cost[row] + x));
   };
   const std::int32_t* HWY_RESTRICT claims = job.claimed.claims;
-  HWY_ALIGN std::int32_t at[HWY_MAX_BYTES / 4];
+  HWY_ALIGN std::int32_t at[HWY_MAX_BYTES / 4], spot[HWY_MAX_BYTES / 4];
   for (int x = 0; x < count; x += lanes) {
     const auto h = hn::LoadU(df, job.h[1] + x);
     const auto known =
@@ -159,10 +165,17 @@ void RejectRow(RejectJob* in_out) {
     }
     hn::Vec<decltype(di)> element, mine;
     Claim(di, job.claimed, x, &element, &mine);
+    // A spot beside its own will do: claims stand on a grid.
     hn::Store(element, di, at);
-    for (int i = 0; i < lanes; ++i) at[i] = claims[at[i]];
-    const auto theirs = hn::And(hn::Load(di, at), hn::Set(di, 0xFFFF));
-    const auto apart = hn::Gt(hn::Abs(hn::Sub(theirs, mine)), hn::Set(di, job.tolerance));
+    auto nearest = hn::Set(di, 0x7FFF);
+    const bool strict = job.strict && job.strict[x / job.tile_width];
+    for (const int aside : {0, -1, 1}) {
+      if (aside != 0 && strict) break;
+      for (int i = 0; i < lanes; ++i) spot[i] = claims[std::max(at[i] + aside, 0)];
+      const auto theirs = hn::And(hn::Load(di, spot), hn::Set(di, 0xFFFF));
+      nearest = hn::Min(nearest, hn::Abs(hn::Sub(theirs, mine)));
+    }
+    const auto apart = hn::Gt(nearest, hn::Set(di, job.tolerance));
     const auto lost = hn::And(known, hn::RebindMask(df, apart));
 
     const auto side = [&](int row, int dx) { return hn::LoadU(df, job.h[row] + x + dx); };
@@ -171,6 +184,7 @@ void RejectRow(RejectJob* in_out) {
     // Comparisons with NaN are false.
     const auto beyond = [&](decltype(h) other) { return hn::Gt(hn::Sub(h, other), jump); };
     auto edge = hn::Or(hn::Or(beyond(up), beyond(down)), hn::Or(beyond(left), beyond(right)));
+    if (!strict) edge = hn::RebindMask(df, hn::Ne(mine, mine));
     if (!hn::AllFalse(df, edge)) {
       // More than 1.3 times and another kMore.
       constexpr int kMore = 40;
@@ -287,11 +301,12 @@ void TriangulateRow(TriangulateJob* job) {
     const auto steep = hn::Max(load(job->steep + x), hn::Set(d, 1.0f));
     const auto one = hn::Set(d, 1.0f);
     // Spread of the least: noise of the costs over the slope beside it.
-    const auto sigma_h = hn::Mul(hn::Add(hn::Div(hn::Mul(hn::Sqrt(hn::Add(cost, hn::Set(d, 20.0f))),
-                                                         hn::Set(d, kSigmaOfCost)),
-                                                 steep),
-                                         hn::Set(d, 0.05f)),
-                                 hn::Set(d, job->step_h));
+    const bool settled = !job->sure || job->sure[x / job->tile_width];
+    const auto slope = hn::Set(d, settled ? kSigmaOfCost : kSigmaOfDoubt);
+    const auto least = hn::Set(d, settled ? kLeastSpread : kLeastOfDoubt);
+    const auto noise = hn::Sqrt(hn::Add(cost, hn::Set(d, 20.0f)));
+    const auto sigma_h =
+        hn::Mul(hn::Add(hn::Div(hn::Mul(noise, slope), steep), least), hn::Set(d, job->step_h));
     auto range = nan, sigma = nan;
     if (job->inverse) {
       // 1 / rho to range along the ray: rho / sin(theta), and 1 / sin(theta) from -cot(theta).

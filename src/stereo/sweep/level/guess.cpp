@@ -9,17 +9,17 @@
 namespace omnister::sweep {
 namespace {
 
-constexpr float kMiddleX = 32, kMiddleY = 24;   ///< where planes are fitted about
-constexpr int kNarrowLanes = 14;                ///< hypotheses of the cheapest chunk
-constexpr int kSearchMargin = 3;                ///< columns beyond what the coarser level found
-constexpr int kMostPlanes = 3;                  ///< of a tile
-constexpr int kSampleStep = 3;                  ///< pixels of the coarser level between samples
-constexpr int kNeeded = 3, kNeededShare = 150;  ///< samples that make the search go somewhere
-constexpr float kOnPlane = 3.4f;                ///< columns off a plane that still belong to it,
-constexpr float kFarOff = 16;                   ///< or are looked for from it
-constexpr int kLeastWidth = 16;                 ///< pixels, of what is searched at once
-constexpr int kBeyond = 8;                      ///< pixels around where a plane was seen
-constexpr float kSteepest = 1.2f;               ///< columns a pixel that a plane may rise
+constexpr float kMiddleX = 32, kMiddleY = 24;  ///< where planes are fitted about
+constexpr int kNarrowLanes = 14;               ///< hypotheses of the cheapest chunk
+constexpr int kSearchMargin = 3;               ///< columns beyond what the coarser level found
+constexpr int kMostPlanes = 3;                 ///< of a tile
+constexpr int kSampleStep = 3;                 ///< pixels of the coarser level between samples
+constexpr int kNeeded = 4, kNeededShare = 80;  ///< samples that make the search go somewhere
+constexpr float kOnPlane = 3.4f;               ///< columns off a plane that still belong to it,
+constexpr float kFarOff = 16;                  ///< or are looked for from it
+constexpr int kLeastWidth = 16;                ///< pixels, of what is searched at once
+constexpr int kBeyond = 8;                     ///< pixels around where a plane was seen
+constexpr float kSteepest = 1.2f;              ///< columns a pixel that a plane may rise
 
 /// Least squares, reweighted. @param rounds 1: from scratch; 3: only refined
 bool fitPlane(const Samples& samples, int start, Plane* guess) {

@@ -47,10 +47,28 @@ struct Samples {
   }
 };
 
+/// What a guess has in the volume of a tile.
+struct Sweep {
+  int guess = 0;            ///< its index
+  int first = 0;            ///< hypothesis of lane 0 of the next
+  int lane = 0, lanes = 0;  ///< in the volume; the outer two are only neighbours
+};
+
 /// What a thread keeps between tiles.
 struct Scratch {
-  std::vector<std::int32_t> base;
-  std::vector<float> residual, residual_sums, residual_mean;
+  std::vector<std::int32_t> base;  ///< by guess and pixel
+  std::vector<float> residual;     ///< likewise
+  std::vector<float> residual_sums, residual_mean;
+  std::vector<Sweep> sweeps;
+  std::vector<std::uint16_t> volume;  ///< costs, by pixel and candidate
+  std::vector<std::uint8_t> near;     ///< as the volume, of 3x3 pixels
+  std::vector<std::uint16_t> block;   ///< by candidate: whether it is only a neighbour
+  std::vector<std::uint16_t> path_sums, across, down, entries, path_room;
+  bool has_paths = false;                            ///< path_sums are those of the tile
+  std::vector<std::int16_t> chosen;                  ///< candidate, by pixel
+  std::vector<std::uint8_t> guess_chosen, guess_of;  ///< by pixel; of each candidate
+  std::vector<std::int16_t> index_of;                ///< hypothesis of each candidate
+  std::vector<std::uint16_t> own_cost;
   MapView view;
   std::vector<std::uint16_t> pairs;
   std::vector<std::uint8_t> reference[kPlanes], costs, grey;

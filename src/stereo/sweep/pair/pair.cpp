@@ -19,8 +19,8 @@
 #include "stereo/sweep/kernels/kernels.h"
 #include "stereo/sweep/level/cost.h"
 #include "stereo/sweep/level/level.h"
+#include "stereo/sweep/paths/candidates.h"
 #include "stereo/sweep/refine/filters.h"
-#include "stereo/sweep/refine/weak_texture.h"
 
 namespace omnister {
 namespace {
@@ -34,13 +34,17 @@ constexpr float kClaimUnits = 4;     ///< of a column, in which claims are compa
 constexpr int kClaimTolerance = 7;   ///< so many of these two may differ by
 constexpr float kClaimScale = 0.5f;  ///< spots a column of the claims image
 constexpr std::int32_t kUnclaimed = std::numeric_limits<std::int32_t>::max();
-constexpr float kEdgeJump = 1.5f;         ///< columns between surfaces at an edge,
-constexpr float kSameSurface = 1.5f;      ///< and on one, at most
-constexpr int kSpeckle = 100;             ///< regions of fewer pixels go,
-constexpr int kSpeckleShare = 3000;       ///< or of less than this part of the image
-constexpr float kMatchedVariance = 6.0f;  ///< of matches in weak texture, times what costs say
-constexpr int kFilledCost = 300;          ///< of matches taken from coarser levels
-constexpr float kWorstShare = 0.34f;      ///< of it, that a match may cost; chance gives a half
+constexpr float kEdgeJump = 1.5f;           ///< columns between surfaces at an edge,
+constexpr float kSameSurface = 1.5f;        ///< and on one, at most
+constexpr int kSpeckle = 100;               ///< regions of fewer pixels go,
+constexpr int kSpeckleShare = 3000;         ///< or of less than this part of the image
+constexpr std::uint16_t kUnowned = 0xFFFF;  ///< cost of a pixel that another guess has
+constexpr float kSureTile = 0.75f;    ///< share of sure windows from which on checks are strict
+constexpr float kWorstShare = 0.32f;  ///< of it, that a match may cost where few others hold;
+                                      ///< chance gives a half
+constexpr float kWorstCorrelation = 0.12f;  ///< likewise
+constexpr float kWorstOfWindow = 0.34f;     ///< where windows decide alone
+constexpr float kFewHold = 0.6f;            ///< share of a tile's matches
 
 class Stopwatch {
  public:
@@ -77,11 +81,11 @@ cv::Mat makePlane(cv::Size size, int type, double value = -1) {
 
 class SweepMatcher : public SweepPair {
  public:
-  SweepMatcher(const StereoGeometry& geometry, const MatcherOptions& options)
+  SweepMatcher(const StereoGeometry& geometry, const MatcherOptions& options, PairChecks checks)
       : geometry_(geometry),
         options_(options),
         compare_(costFunction(options.cost)),
-        weak_fill_(geometry, options.threads) {
+        checks_(checks) {
     const auto& displaced = geometry.displaced.front();
     frame_ = makeEpipolarFrame(displaced.T_ref_disp.translation());
     const WideLens reference_lens = widen(geometry.reference_lens);
@@ -101,7 +105,9 @@ class SweepMatcher : public SweepPair {
       Level& level = levels_[l];
       level.map = makeReferenceMap(reference_lens, geometry.reference_size, l, frame_, options.mask,
                                    options.threads);
-      level.layout = makeLayout(level.map, limits, cv::Size(kTileWidth, kTileHeight));
+      level.layout = makeLayout(level.map, limits,
+                                l + 1 < levels ? cv::Size(kTileWidth, kTileHeight)
+                                               : cv::Size(2 * kTileWidth, 2 * kTileHeight));
       level.grid = makeGrid(&level.layout, level.map, frame_, displaced_lens, displaced.size, l,
                             displaced.T_ref_disp.linear(), kRadius, options.threads);
       limits.hypotheses = (limits.hypotheses + 1) / 2;
@@ -150,7 +156,7 @@ class SweepMatcher : public SweepPair {
       matchLevel(l);
       watch.lap(l == 0 ? "match" : "coarse");
     }
-    finish(reference, displaced.front(), &result, &watch);
+    finish(&result, &watch);
     result.statistics.seconds["total"] =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     return result;
@@ -192,6 +198,8 @@ class SweepMatcher : public SweepPair {
   void prepareClaims() {
     const Level& level = levels_.front();
     const cv::Size size = level.map.size;
+    sure_.assign(level.layout.tiles.size(), 0);
+    all_.assign(level.layout.tiles.size(), 1);
     cost_ = makePlane(size, CV_16UC1);
     steep_ = makePlane(size, CV_16UC1);
     claim_ = makePlane(size, CV_32SC1);
@@ -249,115 +257,47 @@ class SweepMatcher : public SweepPair {
       return;
     }
     const Band& band = level.grid.bands[tile.band];
-    const int width = rect.width + 2 * kRadius, height = rect.height + 2 * kRadius;
-    const int stride = (width + 31) / 32 * 32;
-    const std::size_t room = static_cast<std::size_t>(stride) * height + 64;
-    scratch->base.resize(room);
-    scratch->residual.resize(room);
-    MapJob map_job;
-    map_job.row_scale = static_cast<float>(band.row_scale);
-    map_job.row_offset = static_cast<float>(band.row_offset);
-    map_job.rows = band.rows;
-    map_job.origin = band.origin.data();
-    map_job.cells = level.grid.cells;
-    map_job.to_column = static_cast<float>(1.0 / band.step_h);
-    guessTile(l + 1 < levels_.size() ? &levels_[l + 1].h : nullptr, tile, band, scratch);
-    const MapView& view = scratch->view;
+    const cv::Mat* coarse = l + 1 < levels_.size() ? &levels_[l + 1].h : nullptr;
+    guessTile(coarse, tile, band, scratch);
     viewMap(level.map,
             rect + cv::Size(2 * kViewHalo, 2 * kViewHalo) - cv::Point(kViewHalo, kViewHalo),
             &scratch->view);
     orientGuesses(options_.window, frame_, band, tile, scratch);
-    // Cells of a row of the tile with its halo, from column `from` on.
-    const auto mapTile = [&](const Guess& guess, int y, int from, int count) {
-      const std::size_t at = view.at(rect.x - kRadius + from, rect.y - kRadius + y);
-      map_job.guess_x = guess.x;
-      map_job.guess = guess(static_cast<float>(from - kRadius), static_cast<float>(y - kRadius));
-      map_job.dither_phase = y * kDitherY;
-      mapRow(map_job, &view.phi[at], &view.a[at], count, &scratch->base[y * stride + from],
-             &scratch->residual[y * stride + from]);
-    };
+    const int stride = (rect.width + 2 * kRadius + 31) / 32 * 32;
     compare_.describeTile(level, l == 0, tile, band, stride, scratch);
-
-    const std::size_t inner = rect.area() + 64;
-    scratch->cost.resize(inner);
-    scratch->index.resize(inner);
-    scratch->before.resize(inner);
-    scratch->after.resize(inner);
-    ChunkJob job;
-    job.stride = stride;
-    job.cost = scratch->cost.data();
-    job.index = scratch->index.data();
-    job.before = scratch->before.data();
-    job.after = scratch->after.data();
-    job.scratch = &scratch->costs;
-    for (std::size_t pass = 0; pass < scratch->guesses.size(); ++pass) {
-      const Guess& guess = scratch->guesses[pass];
-      const cv::Rect& where = guess.where;
-      job.width = where.width + 2 * kRadius;
-      job.height = where.height + 2 * kRadius;
-      const std::size_t corner = static_cast<std::size_t>(where.y) * stride + where.x;
-      const auto mapAll = [&] {
-        for (int y = where.y; y < where.y + job.height; ++y) mapTile(guess, y, where.x, job.width);
-      };
-      map_job.dither = 0;
-      mapAll();
-      // Where pixels and columns run in step, costs peak sharply and would lock on to columns.
-      if (inStep(&scratch->residual[corner], stride, job.width, job.height)) {
-        map_job.dither = 1;
-        mapAll();
-      }
-      job.base = scratch->base.data() + corner;
-      for (int p = 0; p < kPlanes; ++p) {
-        job.reference[p] = scratch->reference[p].data() + corner;
-        job.cells[p] = level.cells[p].data() + level.slack;
-      }
-      job.fresh = true;
-      for (const auto& [from, to] : guess.intervals) {
-        for (job.first = from - 1; job.first < to; job.first += job.lanes - 2) {
-          job.lanes = to - job.first < 15 ? 16 : 32;
-          compare_.matchChunk(job);
-          job.fresh = false;
-        }
-      }
-      concludeTile(l, t, stride, guess, pass > 0, scratch);
-    }
-    if (l == 0) claimTile(rect, scratch);
+    mapGuesses(level, tile, band, stride, scratch);
+    fillVolume(compare_, level, tile, stride, scratch);
+    const float sure = chooseCandidates(compare_, level, coarse, tile, band, choiceAt(l), scratch);
+    readChosen(tile, scratch);
+    for (std::size_t g = 0; g < scratch->guesses.size(); ++g)
+      concludeGuess(l, t, stride, g, scratch);
+    if (l > 0) return;
+    sure_[t] = sure > kSureTile ? 1 : 0;
+    claimTile(rect, scratch);
   }
 
-  /// Whether the pixels of most windows fall on columns alike, so that rounding does not average
-  /// out.
-  static bool inStep(const float* residual, int stride, int width, int height) {
-    int alike = 0, all = 0;
-    for (int y = 0; y + kWindow <= height; y += 3 * kWindow) {
-      for (int x = 0; x + kWindow <= width; x += 2 * kWindow) {
-        float sums[kWindow] = {}, all_squares[kWindow] = {};  // by column: these are vectors
-        for (int v = y; v < y + kWindow; ++v) {
-          for (int u = 0; u < kWindow; ++u) {
-            const float r = residual[v * stride + x + u];
-            sums[u] += r;
-            all_squares[u] += r * r;
-          }
-        }
-        const float sum = std::accumulate(sums, sums + kWindow, 0.0f);
-        const float squares = std::accumulate(all_squares, all_squares + kWindow, 0.0f);
-        constexpr float kCount = kWindow * kWindow;
-        // Spread evenly over a column the variance is 1/12.
-        alike += squares / kCount - sum * sum / (kCount * kCount) < 0.04f;
-        ++all;
-      }
-    }
-    return 2 * alike > all;
+  /// Who decides at a level.
+  Choice choiceAt(std::size_t l) const {
+    if (l > 0) return Choice::kPaths;
+    return checks_ == PairChecks::kStrict ? Choice::kWindows : Choice::kPathsIfNeeded;
   }
 
-  /// @param merge whether another pass was concluded before; the lower cost wins
-  void concludeTile(std::size_t l, std::size_t t, int stride, const Guess& guess, bool merge,
-                    Scratch* scratch) {
+  /// The pixels that took a candidate of a guess.
+  void concludeGuess(std::size_t l, std::size_t t, int stride, std::size_t g, Scratch* scratch) {
     Level& level = levels_[l];
     const Tile& tile = level.layout.tiles[t];
     const Band& band = level.grid.bands[tile.band];
+    const Guess& guess = scratch->guesses[g];
     const cv::Rect where = guess.where + tile.rect.tl();
+    const std::size_t room = guessRoom(tile, stride);
+    const auto owns = [&](std::uint8_t owner) { return owner == g; };
+    const auto owner_end = scratch->guess_chosen.begin() + tile.rect.area();
+    const bool merge = g > 0;
+    if (merge && std::none_of(scratch->guess_chosen.begin(), owner_end, owns)) return;
+    scratch->own_cost.resize(where.width + 64);
     scratch->residual_sums.resize(static_cast<std::size_t>(stride) * where.height + 64);
-    boxColumns(&scratch->residual[static_cast<std::size_t>(guess.where.y) * stride + guess.where.x],
+    boxColumns(&scratch->residual[g * room + static_cast<std::size_t>(guess.where.y) * stride +
+                                  guess.where.x],
                stride, where.width + 2 * kRadius, where.height, scratch->residual_sums.data());
     scratch->residual_mean.resize(stride + 64);
     // The finest level's costs are kept, in whole bits.
@@ -374,7 +314,10 @@ class SweepMatcher : public SweepPair {
     job.step_h = static_cast<float>(band.step_h);
     job.guess_x = guess.x;
     job.merge = merge;
-    job.worst_cost = kWorstShare * kFullCost * static_cast<float>(1 << shift);
+    // Coarse levels say where to look, whatever it costs.
+    job.chosen = l > 0 || checks_ == PairChecks::kByTexture;
+    job.worst_cost = job.chosen ? std::numeric_limits<float>::max()
+                                : kWorstOfWindow * kFullCost * static_cast<float>(1 << shift);
     job.parabola = compare_.isParabola();
     job.claim_x = claim_x_;
     job.claim_y = claim_x_;
@@ -386,13 +329,16 @@ class SweepMatcher : public SweepPair {
           static_cast<std::size_t>(guess.where.y + y) * stride + guess.where.x;
       boxMeanRow(&scratch->residual_sums[static_cast<std::size_t>(y) * stride], where.width,
                  scratch->residual_mean.data());
-      const std::size_t i = static_cast<std::size_t>(y) * where.width;
+      const std::size_t i =
+          static_cast<std::size_t>(guess.where.y + y) * tile.rect.width + guess.where.x;
       const std::size_t pixel = scratch->view.at(where.x, where.y + y);
-      job.cost = &scratch->cost[i];
+      for (int x = 0; x < where.width; ++x)
+        scratch->own_cost[x] = owns(scratch->guess_chosen[i + x]) ? scratch->cost[i + x] : kUnowned;
+      job.cost = scratch->own_cost.data();
       job.index = &scratch->index[i];
       job.before = &scratch->before[i];
       job.after = &scratch->after[i];
-      job.base = &scratch->base[corner + kRadius * stride + kRadius];
+      job.base = &scratch->base[g * room + corner + kRadius * stride + kRadius];
       job.phi = &scratch->view.phi[pixel];
       job.a = &scratch->view.a[pixel];
       job.guess = guess(static_cast<float>(guess.where.x), static_cast<float>(guess.where.y + y));
@@ -461,8 +407,44 @@ class SweepMatcher : public SweepPair {
     return all.front();
   }
 
-  void finish(const cv::Mat& reference, const cv::Mat& displaced, MatchResult* result,
-              Stopwatch* watch) {
+  /// Where most matches of a tile did not pass the checks, only windows that match well by
+  /// themselves stay: paths lay surfaces through whatever they are given.
+  /// @return pixels that went
+  std::size_t dropDoubtful(cv::Mat* h) const {
+    const Level& level = levels_.front();
+    const float share = compare_.isParabola() ? kWorstCorrelation : kWorstShare;
+    const auto worst = static_cast<std::uint16_t>(share * kFullCost);
+    std::vector<std::size_t> dropped(level.layout.tiles.size(), 0);
+    parallelFor(
+        0, dropped.size(), options_.threads,
+        [&](std::size_t t) {
+          const Tile& tile = level.layout.tiles[t];
+          if (tile.band < 0 || sure_[t]) return;
+          int found = 0, left = 0;
+          for (int y = tile.rect.y; y < tile.rect.br().y; ++y) {
+            const float* before = level.h.ptr<float>(y) + tile.rect.x;
+            const float* after = h->ptr<float>(y) + tile.rect.x;
+            for (int x = 0; x < tile.rect.width; ++x) {
+              found += before[x] == before[x];  // not NaN
+              left += after[x] == after[x];
+            }
+          }
+          if (static_cast<float>(left) > kFewHold * static_cast<float>(found)) return;
+          for (int y = tile.rect.y; y < tile.rect.br().y; ++y) {
+            const std::uint16_t* cost = cost_.ptr<std::uint16_t>(y) + tile.rect.x;
+            float* here = h->ptr<float>(y) + tile.rect.x;
+            for (int x = 0; x < tile.rect.width; ++x) {
+              if (std::isnan(here[x]) || cost[x] <= worst) continue;
+              here[x] = kNaN;
+              ++dropped[t];
+            }
+          }
+        },
+        8);
+    return std::accumulate(dropped.begin(), dropped.end(), std::size_t{0});
+  }
+
+  void finish(MatchResult* result, Stopwatch* watch) {
     Level& level = levels_.front();
     const int width = level.map.size.width, height = level.map.size.height;
     constexpr int kStrip = 48;
@@ -502,6 +484,7 @@ class SweepMatcher : public SweepPair {
       job.claimed.count = width;
       job.tolerance = kClaimTolerance;
       job.jump = kEdgeJump * finest_step_;
+      job.tile_width = kTileWidth;
       const auto reject = [&](int y) {
         job.out = scratch.rows[(y + kAverageRows) % kAverageRows].data() + 16;
         if (y < 0 || y >= height) {
@@ -517,6 +500,8 @@ class SweepMatcher : public SweepPair {
         job.claimed.h = job.h[1];
         job.claimed.cost = job.cost[1];
         job.claimed.claim = claim_.ptr<std::int32_t>(y);
+        const std::vector<std::uint8_t>& strict = checks_ == PairChecks::kStrict ? all_ : sure_;
+        job.strict = &strict[static_cast<std::size_t>(y / kTileHeight) * level.layout.tiles_x];
         const RejectJob before = job;
         rejectRow(&job);
         // What belongs to the strips around is counted there.
@@ -543,12 +528,13 @@ class SweepMatcher : public SweepPair {
     rejected["left-right"] = lost;
     rejected["depth edge"] = edge;
     watch->lap("check");
-    rejected["speckle"] =
-        removeSpeckles(&smooth, finest_step_, std::max(kSpeckle, width * height / kSpeckleShare),
-                       options_.threads);
+    const int region = std::max(kSpeckle, width * height / kSpeckleShare);
+    rejected["speckle"] = removeSpeckles(&smooth, finest_step_, region, options_.threads);
+    const std::size_t doubtful = dropDoubtful(&smooth);
+    if (doubtful > 0)
+      rejected["speckle"] += removeSpeckles(&smooth, finest_step_, region, options_.threads);
+    rejected["no match"] += doubtful;
     watch->lap("speckle");
-    fillFromCoarse(reference, displaced, &smooth, &rejected);
-    watch->lap("fill");
 
     std::vector<TriangulateJob> points(strips);
     forRows([&](std::size_t s, int begin, int end) {
@@ -561,8 +547,12 @@ class SweepMatcher : public SweepPair {
       job.max_range = options_.max_range > 0 ? static_cast<float>(options_.max_range)
                                              : std::numeric_limits<float>::max();
       job.full_cost = kWorstShare * kFullCost;
+      job.tile_width = kTileWidth;
       for (int y = begin; y < end; ++y) {
         viewMap(level.map, cv::Rect(0, y, width, 1), &view);
+        // Several pairs tell their errors apart by themselves.
+        const std::vector<std::uint8_t>& sure = checks_ == PairChecks::kStrict ? all_ : sure_;
+        job.sure = &sure[static_cast<std::size_t>(y / kTileHeight) * level.layout.tiles_x];
         job.a = view.a.data();
         job.h = smooth.ptr<float>(y);
         job.cost = cost_.ptr<std::uint16_t>(y);
@@ -585,55 +575,10 @@ class SweepMatcher : public SweepPair {
     watch->lap("triangulate");
   }
 
-  /// Weak texture: what coarser levels matched.
-  void fillFromCoarse(const cv::Mat& reference, const cv::Mat& displaced, cv::Mat* smooth,
-                      std::map<std::string, std::size_t>* rejected) {
-    if (levels_.size() < 2) return;
-    const Level& level = levels_.front();
-    WeakFill::Job job;
-    job.reference = reference;
-    job.displaced = displaced;
-    job.half = &levels_[1].map;
-    job.baseline = static_cast<float>(frame_.baseline);
-    job.map = &level.map;
-    job.certainty = [&](int x, int y) {
-      const float cost = static_cast<float>(cost_.at<std::uint16_t>(y, x));
-      const float steep = std::max<float>(steep_.at<std::uint16_t>(y, x), 1.0f);
-      const float spread = (kSigmaOfCost * std::sqrt(cost + 20.0f) / steep + 0.05f) * finest_step_;
-      return 1 / (kMatchedVariance * spread * spread);
-    };
-    job.step = finest_step_;
-    for (std::size_t l = 1; l < levels_.size(); ++l) {
-      float step = std::numeric_limits<float>::max();
-      for (const Band& band : levels_[l].grid.bands)
-        step = std::min(step, static_cast<float>(band.step_h));
-      job.coarse.push_back({&levels_[l].h, step});
-    }
-    job.least_region = std::max(kSpeckle, level.map.size.area() / kSpeckleShare);
-    cv::Mat sigma;
-    const std::size_t filled = weak_fill_.fill(job, smooth, &sigma);
-    if (filled == 0) return;
-    (*rejected)["speckle"] -= std::min((*rejected)["speckle"], filled);
-    // Costs from which triangulation makes that sigma again.
-    parallelFor(0, static_cast<std::size_t>(sigma.rows), options_.threads, [&](std::size_t row) {
-      const int y = static_cast<int>(row);
-      const float* spread = sigma.ptr<float>(y);
-      std::uint16_t* cost = cost_.ptr<std::uint16_t>(y);
-      std::uint16_t* steep = steep_.ptr<std::uint16_t>(y);
-      for (int x = 0; x < sigma.cols; ++x) {
-        if (std::isnan(spread[x])) continue;
-        cost[x] = kFilledCost;
-        const float columns = std::max(spread[x] / finest_step_ - 0.05f, 0.02f);
-        const float slope = kSigmaOfCost * std::sqrt(kFilledCost + 20.0f) / columns;
-        steep[x] = static_cast<std::uint16_t>(std::clamp(slope, 1.0f, 1000.0f));
-      }
-    });
-  }
-
   StereoGeometry geometry_;
   MatcherOptions options_;
   const CostFunction& compare_;
-  WeakFill weak_fill_;
+  PairChecks checks_;
   EpipolarFrame frame_;
   std::vector<Level> levels_;
   std::unique_ptr<tbb::enumerable_thread_specific<Scratch>> scratch_ =
@@ -641,6 +586,8 @@ class SweepMatcher : public SweepPair {
   std::vector<std::uint16_t> pairs_;  ///< of the displaced image that is described
   cv::Mat cost_, steep_, claim_;      ///< of the finest level
   cv::Mat planes_[3];                 ///< of the last result
+  std::vector<std::uint8_t> all_;     ///< as sure_, of ones
+  std::vector<std::uint8_t> sure_;    ///< by tile of the finest level: nearly all windows are sure
   std::size_t field_ = 0;             ///< pixels with a ray
   float finest_step_ = 0;             ///< least hypothesis step of any band
   // Claims on spots of the displaced image, kept on an equal-area map of (phi, theta').
@@ -662,9 +609,9 @@ void checkSweep(const StereoGeometry& geometry, const MatcherOptions& options) {
 }
 
 std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,
-                                         const MatcherOptions& options) {
+                                         const MatcherOptions& options, PairChecks checks) {
   checkSweep(geometry, options);
-  return std::make_unique<SweepMatcher>(geometry, options);
+  return std::make_unique<SweepMatcher>(geometry, options, checks);
 }
 
 }  // namespace omnister

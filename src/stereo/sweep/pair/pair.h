@@ -15,6 +15,14 @@ class SweepPair : public Matcher {
   virtual void takeBuffers(SweepPair* other) = 0;
 };
 
+/// How firmly a pair's matches are checked.
+enum class PairChecks {
+  kByTexture,  ///< strictly where the texture is rich; elsewhere near misses pass too
+  /// Windows decide alone and checks are strict, for those who match several pairs: what one of
+  /// them misses another sees.
+  kStrict,
+};
+
 /// Refuses what no sweep can match, or what would need too much memory.
 /// @throws Error as makeMatcher()
 void checkSweep(const StereoGeometry& geometry, const MatcherOptions& options);
@@ -22,6 +30,7 @@ void checkSweep(const StereoGeometry& geometry, const MatcherOptions& options);
 /// @param geometry with one displaced camera
 /// @throws Error as makeMatcher()
 std::unique_ptr<SweepPair> makeSweepPair(const StereoGeometry& geometry,
-                                         const MatcherOptions& options);
+                                         const MatcherOptions& options,
+                                         PairChecks checks = PairChecks::kByTexture);
 
 }  // namespace omnister
