@@ -24,11 +24,12 @@ std::string_view targetTypeName(TargetType type);
 ///   twice that, and every second row is shifted by `square_m`.
 /// - charuco: markers number the white squares row by row from the top left. The square at the top
 /// left
-///   is black, as in OpenCV 4.7 and later; with `legacy` the one at the bottom left is (OpenCV
-///   to 4.6, which differs for an even number of rows only).
-/// - aprilgrid: Kalibr's layout, tags number the rows from the bottom left; its black squares at
-/// the
-///   corners of the tags are there with `joining_squares`.
+///   is black, as in OpenCV 4.6.0 and later; with `legacy` the one at the bottom left is (OpenCV
+///   before 4.6.0, which differs for an even number of rows only).
+/// - aprilgrid: Kalibr's layout, tags number the rows from the bottom left. Kalibr's tags have a
+/// black
+///   border of two bits and black squares at their corners (`border_bits: 2`, `joining_squares`);
+///   tags as their inventors draw them have a border of one bit.
 struct Target {
   TargetType type = TargetType::kCheckerboard;
   int cols = 0;  ///< checkerboard: inner corners a row; circles: dots a row; charuco and
@@ -41,10 +42,15 @@ struct Target {
   std::string dictionary{};      ///< charuco: e.g. DICT_4X4_50; aprilgrid: tag36h11
   double dot_m = 0.0;            ///< circles: diameter of a dot [m]; 0: half the spacing
   bool legacy = false;           ///< charuco: see above
-  bool joining_squares = false;  ///< aprilgrid: see above
+  bool joining_squares = false;  ///< aprilgrid: see above; detectors look for themselves
+  /// aprilgrid: width of a tag's black border, 1 or 2 bits. 0: not known, detectors try both and
+  /// drawings have 1.
+  int border_bits = 0;
 };
 
-/// `{type: checkerboard, cols: 8, rows: 6, square_m: 0.0244}`; unknown keys are refused.
+/// `{type: checkerboard, cols: 8, rows: 6, square_m: 0.0244}`, or Kalibr's own target file
+/// (`target_type`, `tagCols`, ...: its aprilgrid, checkerboard and circlegrid); unknown keys are
+/// refused.
 /// @throws InputError naming key, value and what was expected
 Target parseTarget(std::string_view text, std::string_view source);
 Target readTarget(const std::filesystem::path& path);

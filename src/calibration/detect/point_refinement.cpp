@@ -136,6 +136,73 @@ struct CornerFit {
   }
 };
 
+// Width of a tag's black border as a share of the tag: the narrower one where it is not known.
+double borderShare(const Target& target) {
+  const int bits = std::max(1, target.border_bits);
+  return static_cast<double>(bits) / tags::aprilFamily(target.dictionary, bits)->width_at_border;
+}
+
+// Width of the tags' black border where it is not known: a border of two bits is dark as far in as
+// the code of the others begins.
+int borderSeen(const cv::Mat& fine, const Target& target, const Expected& expected) {
+  const int cells = tags::aprilFamily(target.dictionary, 2)->width_at_border;
+  const double in = 1.5 / cells * target.square_m;
+  const double rim = 0.5 / cells * target.square_m;
+  int dark = 0;
+  int light = 0;
+  for (std::size_t id = 0; id < expected.size(); ++id) {
+    if (!expected[id]) continue;
+    const int col = static_cast<int>(id) % (2 * target.cols);
+    const int row = static_cast<int>(id) / (2 * target.cols);
+    const Eigen::Vector2d way(col % 2 == 0 ? 1.0 : -1.0, row % 2 == 0 ? 1.0 : -1.0);
+    const auto at = [&](double x, double y) {
+      return grayAt(fine, expected[id]->pixel +
+                              expected[id]->jacobian * Eigen::Vector2d(x * way.x(), y * way.y()));
+    };
+    const auto white = at(0.25 * target.square_m, -0.4 * target.spacing * target.square_m);
+    const auto black = at(0.25 * target.square_m, rim);
+    if (!white || !black || *white - *black < 8.0) continue;
+    for (double along = 1.5; along < 0.5 * cells; ++along) {
+      for (const bool across : {false, true}) {
+        const double x = along / cells * target.square_m;
+        const auto gray = across ? at(in, x) : at(x, in);
+        if (gray) (*gray < 0.5 * (*white + *black) ? dark : light) += 1;
+      }
+    }
+  }
+  return dark > 9 * light ? 2 : 1;
+}
+
+// Whether the picture shows dark squares at the corners of the tags: by the middles of the squares
+// against border and gap beside them, most tags deciding.
+bool showsJoiningSquares(const cv::Mat& fine, const Target& target, const Expected& expected) {
+  const double out = 0.5 * target.spacing * target.square_m;
+  const double in = 0.5 * borderShare(target) * target.square_m;
+  const double along = 0.25 * target.square_m;
+  int dark = 0;
+  int light = 0;
+  for (std::size_t id = 0; id < expected.size(); ++id) {
+    if (!expected[id]) continue;
+    const int col = static_cast<int>(id) % (2 * target.cols);
+    const int row = static_cast<int>(id) / (2 * target.cols);
+    // Outwards from the tag.
+    const Eigen::Vector2d way(col % 2 == 0 ? -1.0 : 1.0, row % 2 == 0 ? -1.0 : 1.0);
+    const auto at = [&](double x, double y) {
+      return grayAt(fine, expected[id]->pixel +
+                              expected[id]->jacobian * Eigen::Vector2d(x * way.x(), y * way.y()));
+    };
+    const auto square = at(out, out);
+    const auto border = at(-in, -in);
+    const auto gap_x = at(-along, out);
+    const auto gap_y = at(out, -along);
+    if (!square || !border || !gap_x || !gap_y) continue;
+    const double white = 0.5 * (*gap_x + *gap_y);
+    if (white - *border < 8.0) continue;
+    (*square < 0.5 * (white + *border) ? dark : light) += 1;
+  }
+  return dark + light > 0 ? dark > light : target.joining_squares;
+}
+
 // Where only a corner's own edges are, in the board's axes about it [m].
 struct Clear {
   double half = 0.0;   ///< half side of the square looked at
@@ -145,8 +212,8 @@ struct Clear {
 
 Clear clearAround(const Target& target, unsigned dark) {
   if (target.type == TargetType::kAprilGrid) {
-    const double cells = tags::aprilFamily(target.dictionary)->width_at_border;
-    return {std::min(target.spacing, 0.5) * target.square_m, dark, target.square_m / cells};
+    return {std::min(target.spacing, 0.5) * target.square_m, dark,
+            target.square_m * borderShare(target)};
   }
   const unsigned light = (kPlusPlus | kMinusPlus | kMinusMinus | kPlusMinus) & ~dark;
   const bool charuco = target.type == TargetType::kCharuco;
@@ -360,10 +427,13 @@ std::optional<Eigen::Vector2d> crossing(const Side& a, const Side& b, Eigen::Vec
   return std::nullopt;
 }
 
-void measureTags(const cv::Mat& fine, const Target& target, const Expected& expected,
+void measureTags(const cv::Mat& fine, const Target& asked, const Expected& expected,
                  Measured& measured) {
+  Target target = asked;
+  if (target.border_bits == 0) target.border_bits = borderSeen(fine, target, expected);
   const int points_a_row = 2 * target.cols;
-  const double cells = tags::aprilFamily(target.dictionary)->width_at_border;
+  const double border = borderShare(target);
+  const bool joined = showsJoiningSquares(fine, target, expected);
   for (int row = 0; row < target.rows; ++row) {
     for (int col = 0; col < target.cols; ++col) {
       const int first = 2 * row * points_a_row + 2 * col;
@@ -377,7 +447,7 @@ void measureTags(const cv::Mat& fine, const Target& target, const Expected& expe
       double axis = 1e300;
       for (const int id : ids) axis = std::min(axis, shorterAxis(expected[id]->jacobian));
       // The lines across a side stay within the black border and the gap.
-      const double width = target.square_m * axis * std::min(1.0 / cells, target.spacing);
+      const double width = target.square_m * axis * std::min(border, target.spacing);
       const double half = std::clamp(0.9 * width, 1.5, 6.0);
       std::array<Side, 4> sides;
       std::array<bool, 4> fitted{};
@@ -408,7 +478,7 @@ void measureTags(const cv::Mat& fine, const Target& target, const Expected& expe
         // The quadrant of the tag; with joining squares, the one across as well.
         constexpr unsigned kInside[4] = {kPlusPlus, kMinusPlus, kMinusMinus, kPlusMinus};
         const unsigned tag = kInside[i];
-        const unsigned dark = target.joining_squares ? tag | kInside[(i + 2) % 4] : tag;
+        const unsigned dark = joined ? tag | kInside[(i + 2) % 4] : tag;
         Clear clear = clearAround(target, dark);
         clear.coded = tag;
         const auto corner = fitCorner(fine, dark, clear, {*point, frame.jacobian});

@@ -36,6 +36,7 @@ double firstSquareContrast(const cv::Mat& fine, const Target& target, const Expe
 /// printed.
 struct Marker {
   int id = 0;
+  int border_bits = 1;                             ///< AprilGrids: as Target::border_bits
   Eigen::Vector2i cell = Eigen::Vector2i::Zero();  ///< column and row
   std::vector<Eigen::Vector2d> board;              ///< corners on the board [m]
   std::vector<Eigen::Vector2d> pixels;             ///< and in the picture [px]

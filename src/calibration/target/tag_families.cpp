@@ -7,6 +7,7 @@
 #include <apriltag/tag36h11.h>
 
 #include <array>
+#include <cstdint>
 #include <utility>
 
 namespace omnister::tags {
@@ -69,9 +70,19 @@ cv::Mat arucoBits(const std::string& dictionary, int id) {
   return bits;
 }
 
-AprilFamily aprilFamily(const std::string& name) {
+AprilFamily aprilFamily(const std::string& name, int border_bits) {
   for (const FamilyFunctions& family : kFamilies) {
-    if (name == family.name) return AprilFamily(family.create(), family.destroy);
+    if (name != family.name) continue;
+    AprilFamily tags(family.create(), family.destroy);
+    // The same codes inside a wider frame.
+    const int wider = border_bits - 1;
+    tags->width_at_border += 2 * wider;
+    tags->total_width += 2 * wider;
+    for (std::uint32_t bit = 0; bit < tags->nbits; ++bit) {
+      tags->bit_x[bit] += wider;
+      tags->bit_y[bit] += wider;
+    }
+    return tags;
   }
   return nullptr;
 }
@@ -84,8 +95,8 @@ std::string aprilFamilyNames() {
   return names;
 }
 
-cv::Mat aprilBits(const std::string& family, int id) {
-  const AprilFamily tags = aprilFamily(family);
+cv::Mat aprilBits(const std::string& family, int id, int border_bits) {
+  const AprilFamily tags = aprilFamily(family, border_bits);
   // The outline is one cell inside the drawing: white, the black border, the bits.
   const std::unique_ptr<image_u8_t, void (*)(image_u8_t*)> image(apriltag_to_image(tags.get(), id),
                                                                  image_u8_destroy);

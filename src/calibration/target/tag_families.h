@@ -24,10 +24,11 @@ cv::Mat arucoBits(const std::string& dictionary, int id);
 using AprilFamily = std::shared_ptr<apriltag_family_t>;
 /// A new instance (a family holds the decoder's tables, which detectors on several threads must not
 /// share). Null for an unknown name.
-AprilFamily aprilFamily(const std::string& name);
+/// @param border_bits width of the black border, 1 (as its inventors draw it) or 2 (Kalibr's)
+AprilFamily aprilFamily(const std::string& name, int border_bits = 1);
 std::string aprilFamilyNames();
 /// As arucoBits().
-cv::Mat aprilBits(const std::string& family, int id);
+cv::Mat aprilBits(const std::string& family, int id, int border_bits = 1);
 
 /// Whether a square of a ChArUco board is black.
 bool charucoBlack(const Target& target, int col, int row);

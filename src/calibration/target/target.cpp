@@ -4,11 +4,11 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <map>
 #include <optional>
-#include <set>
 
+#include "calibration/target/kalibr_target.h"
 #include "calibration/target/tag_families.h"
+#include "calibration/target/target_keys.h"
 #include "omnister/common/error.h"
 #include "omnister/common/file_io.h"
 #include "omnister/common/numbers.h"
@@ -28,78 +28,6 @@ constexpr std::array<std::pair<TargetType, std::string_view>, 4> kTypes{{
     {TargetType::kCharuco, "charuco"},
     {TargetType::kAprilGrid, "aprilgrid"},
 }};
-
-std::string inQuotes(std::string_view text) { return "'" + printable(text, 60) + "'"; }
-
-// The keys of one mapping. Every one must be asked for, or finish() names it as unknown.
-class Keys {
- public:
-  Keys(const YAML::Node& map, std::string_view source) : source_(source) {
-    for (const auto& entry : map) {
-      if (!entry.first.IsScalar()) throw InputError(source_, "", "has a key that is not a word");
-      const std::string& key = entry.first.Scalar();
-      if (!values_.emplace(key, entry.second).second) {
-        throw InputError(source_, key, "stands there twice");
-      }
-    }
-  }
-
-  std::optional<std::string> text(const std::string& key) {
-    const auto found = values_.find(key);
-    if (found == values_.end()) return std::nullopt;
-    known_.insert(key);
-    if (!found->second.IsScalar()) throw InputError(source_, key, "is not a single value");
-    return found->second.Scalar();
-  }
-
-  std::string required(const std::string& key, std::string_view expected) {
-    auto value = text(key);
-    if (!value) throw InputError(source_, key, "is missing, expected " + std::string(expected));
-    return *value;
-  }
-
-  int integer(const std::string& key) {
-    const std::string value = required(key, "a whole number");
-    const auto number = parseNumber(value);
-    if (!number || *number != std::floor(*number) || std::abs(*number) > 1e6) {
-      throw InputError(source_, key, "is " + inQuotes(value) + ", expected a whole number");
-    }
-    return static_cast<int>(*number);
-  }
-
-  double number(const std::string& key) {
-    const std::string value = required(key, "a number");
-    const auto parsed = parseNumber(value);
-    if (!parsed) throw InputError(source_, key, "is " + inQuotes(value) + ", expected a number");
-    return *parsed;
-  }
-
-  double number(const std::string& key, double otherwise) {
-    return values_.count(key) == 0 ? otherwise : number(key);
-  }
-
-  bool flag(const std::string& key) {
-    const auto value = text(key);
-    if (!value || *value == "false") return false;
-    if (*value == "true") return true;
-    throw InputError(source_, key, "is " + inQuotes(*value) + ", expected true or false");
-  }
-
-  void finish(std::string_view type) const {
-    for (const auto& [key, value] : values_) {
-      if (known_.count(key) != 0) continue;
-      std::string list;
-      for (const auto& name : known_) list += (list.empty() ? "" : ", ") + name;
-      throw InputError(source_, key,
-                       "is not a key of " + std::string(type) + ", which has " + list);
-    }
-  }
-
- private:
-  std::string source_;
-  std::map<std::string, YAML::Node> values_;
-  std::set<std::string> known_;
-};
 
 void checkCount(int value, int low, int high, std::string_view source, std::string_view key) {
   if (value < low || value > high) {
@@ -215,6 +143,11 @@ void checkTarget(const Target& target, std::string_view source) {
                          "has " + std::to_string(family->ncodes) + " tags, but the board needs " +
                              std::to_string(target.cols * target.rows));
       }
+      if (target.border_bits < 0 || target.border_bits > 2) {
+        throw InputError(source, "border_bits",
+                         "is " + std::to_string(target.border_bits) +
+                             ", expected 1 or 2 (Kalibr's): the width of a tag's black border");
+      }
       break;
     }
   }
@@ -227,7 +160,12 @@ Target parseTarget(std::string_view text, std::string_view source) {
         source, "",
         "expected a target such as {type: checkerboard, cols: 8, rows: 6, square_m: 0.0244}");
   }
-  Keys keys(root, source);
+  if (isKalibrTarget(root)) {
+    const Target target = parseKalibrTarget(root, source);
+    checkTarget(target, source);
+    return target;
+  }
+  TargetKeys keys(root, source);
   const std::string name = keys.required("type", "checkerboard, circles, charuco or aprilgrid");
   const auto type =
       std::find_if(kTypes.begin(), kTypes.end(), [&](const auto& t) { return t.second == name; });
@@ -257,6 +195,10 @@ Target parseTarget(std::string_view text, std::string_view source) {
       target.spacing = keys.number("spacing");
       target.dictionary = keys.text("dictionary").value_or("tag36h11");
       target.joining_squares = keys.flag("joining_squares");
+      if (keys.has("border_bits")) {
+        target.border_bits = keys.integer("border_bits");
+        checkCount(target.border_bits, 1, 2, source, "border_bits");
+      }
       break;
   }
   keys.finish(name);
@@ -287,6 +229,7 @@ std::string formatTarget(const Target& target) {
     case TargetType::kAprilGrid:
       text += ", spacing: " + formatNumber(target.spacing) + ", dictionary: " + target.dictionary;
       if (target.joining_squares) text += ", joining_squares: true";
+      if (target.border_bits > 0) text += ", border_bits: " + std::to_string(target.border_bits);
       break;
   }
   return text + "}\n";
@@ -408,8 +351,8 @@ TargetArtwork targetArtwork(const Target& target) {
       for (int row = 0; row < target.rows; ++row) {
         for (int col = 0; col < target.cols; ++col) {
           const int id = (target.rows - 1 - row) * target.cols + col;
-          addMarker(tags::aprilBits(target.dictionary, id), col * pitch, row * pitch, side,
-                    artwork);
+          addMarker(tags::aprilBits(target.dictionary, id, std::max(1, target.border_bits)),
+                    col * pitch, row * pitch, side, artwork);
         }
       }
       if (target.joining_squares) {

@@ -24,6 +24,8 @@ struct Arguments {
   double spacing = 0.3;
   bool asymmetric = false;
   bool legacy = false;
+  int border_bits = 2;
+  bool plain_corners = false;
   bool joining_squares = false;
 };
 
@@ -61,7 +63,10 @@ Target makeTarget(const Arguments& arguments) {
     target.type = TargetType::kAprilGrid;
     target.spacing = arguments.spacing;
     target.dictionary = arguments.dictionary.empty() ? "tag36h11" : arguments.dictionary;
-    target.joining_squares = arguments.joining_squares;
+    target.border_bits = arguments.border_bits;
+    // Kalibr's tags come with the squares; a border of one bit is the inventors' own drawing.
+    target.joining_squares =
+        arguments.joining_squares || (arguments.border_bits == 2 && !arguments.plain_corners);
   }
   checkTarget(target, "target");
   return target;
@@ -96,6 +101,11 @@ void run(const Arguments& arguments, bool json) {
   result["page_width_mm"] = layout.page.width_mm;
   result["page_height_mm"] = layout.page.height_mm;
   printResult(json, result);
+  if (target.type == TargetType::kAprilGrid) {
+    say(target.border_bits == 2
+            ? "The tags have Kalibr's border of two bits; --border-bits 1 prints the other."
+            : "The tags have a border of one bit; Kalibr wants two, --border-bits 2.");
+  }
   say("Print at 100 %, without fitting to the page, and check the bar of " +
       std::to_string(static_cast<int>(layout.bar_mm)) + " mm with a ruler.");
 }
@@ -127,14 +137,25 @@ void addTarget(CLI::App& app) {
       "charuco: e.g. DICT_4X4_50 (default: the smallest of 4x4 bits that suffices); "
       "aprilgrid: tag36h11 (default), tag36h10, tag25h9 or tag16h5");
   command->add_flag("--legacy", arguments->legacy,
-                    "charuco: layout of OpenCV up to 4.6 (matters for an even number of rows)");
+                    "charuco: layout of OpenCV before 4.6.0 (matters for an even number of rows)");
   command
       ->add_option("--spacing", arguments->spacing,
                    "aprilgrid: gap between tags as a share of the tag")
       ->capture_default_str();
-  command->add_flag("--joining-squares", arguments->joining_squares,
-                    "aprilgrid: Kalibr's black squares at the corners of the tags; more accurate "
-                    "corners, slower to find");
+  command
+      ->add_option("--border-bits", arguments->border_bits,
+                   "aprilgrid: width of a tag's black border: 2 as Kalibr prints it, with black "
+                   "squares at the corners of the tags; 1 as the tags' inventors do, without")
+      ->check(CLI::Range(1, 2))
+      ->capture_default_str();
+  CLI::Option* joining =
+      command->add_flag("--joining-squares", arguments->joining_squares,
+                        "aprilgrid: Kalibr's black squares at the corners of the tags, with "
+                        "--border-bits 1 too; more accurate corners, slower to find");
+  command
+      ->add_flag("--no-joining-squares", arguments->plain_corners,
+                 "aprilgrid: without these squares, with --border-bits 2 too")
+      ->excludes(joining);
   command->add_flag("--asymmetric", arguments->asymmetric,
                     "circles: every second row shifted by the spacing");
   command->add_option("--dot-mm", arguments->dot_mm,

@@ -96,7 +96,9 @@ std::string describe(const Target& target) {
              (target.legacy ? ", legacy" : "");
     case TargetType::kAprilGrid:
       return "aprilgrid, " + size + " tags of " + square + ", gap " +
-             millimetres(1e3 * target.square_m * target.spacing) + " mm, " + target.dictionary;
+             millimetres(1e3 * target.square_m * target.spacing) + " mm, " + target.dictionary +
+             ", border of " + std::to_string(std::max(1, target.border_bits)) + " bit" +
+             (target.border_bits == 2 ? "s (Kalibr's)" : "");
   }
   return "";
 }

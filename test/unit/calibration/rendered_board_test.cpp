@@ -191,6 +191,59 @@ TEST(RenderedBoard, AprilGridWithJoiningSquares) {
   expectWhole(run(target, kWhole, "kalibr"), kWhole.size(), 0.03, 0.03);
 }
 
+// Kalibr's border of two bits, found by itself and as well as the other; the squares too.
+TEST(RenderedBoard, AprilGridWithKalibrsBorder) {
+  const std::string board = "{type: aprilgrid, cols: 4, rows: 4, square_m: 0.05, spacing: 0.3";
+  const Target target = make(board + ", joining_squares: true, border_bits: 2}");
+  expectWhole(run(target, kWhole, "kalibr2"), kWhole.size(), 0.03, 0.03);
+  const LensPtr lens = wideLens(kSize);
+  for (const char* shown : {", border_bits: 2}", ", border_bits: 2, joining_squares: true}",
+                            ", border_bits: 1, joining_squares: true}", ", border_bits: 1}"}) {
+    const Target drawn = make(board + shown);
+    const Pose pose = boardPose(drawn, kWhole[0]);
+    const auto view = detectTarget(draw(drawn, pose, *lens, kSize), make(board + "}"));
+    ASSERT_TRUE(view) << shown;
+    Score score;
+    score.add(*view, *lens, pose);
+    EXPECT_EQ(score.found, 64) << shown;
+    EXPECT_LT(score.rms(), 0.08) << shown;
+  }
+}
+
+// Small pictures, tags of 9 to 40 pixels: as many corners with either border.
+TEST(RenderedBoard, AprilGridInSmallPictures) {
+  const std::vector<Placement> placements = {{10, 30, 0.35, 35, 20},  {50, 200, 0.34, -30, 10},
+                                             {68, 340, 0.36, 20, 75}, {78, 170, 0.30, 0, 8},
+                                             {30, 100, 0.5, 25, 40},  {0, 0, 0.6, 40, 0}};
+  struct Row {
+    int side;
+    double least;  ///< of all corners, with either border
+  };
+  for (const Row& row : {Row{512, 0.7}, {1024, 0.85}}) {
+    const cv::Size size(row.side, row.side);
+    const LensPtr lens = wideLens(size);
+    std::map<int, Score> scores;
+    for (const int border : {1, 2}) {
+      for (const Placement& placement : placements) {
+        const Target target = make(
+            "{type: aprilgrid, cols: 6, rows: 6, square_m: 0.04, spacing: 0.3, "
+            "joining_squares: true, border_bits: " +
+            std::to_string(border) + "}");
+        const Pose pose = boardPose(target, placement);
+        scores[border].visible += 144;
+        if (const auto view = detectTarget(draw(target, pose, *lens, size), target)) {
+          scores[border].add(*view, *lens, pose);
+        }
+      }
+      std::cout << row.side << " px, border of " << border << ": " << scores[border] << '\n';
+      EXPECT_LE(scores[border].wrong, 3);
+      EXPECT_GE(scores[border].found, row.least * scores[border].visible);
+    }
+    EXPECT_GE(scores[2].found, 0.98 * scores[1].found);
+    EXPECT_LT(scores[2].rms(), 1.2 * scores[1].rms());
+  }
+}
+
 // Without a lens, a dot's centroid is not the image of its centre: a tenth of a pixel or two.
 TEST(RenderedBoard, Circles) {
   const Target target = make("{type: circles, cols: 7, rows: 6, square_m: 0.035}");

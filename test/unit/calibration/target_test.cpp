@@ -5,6 +5,7 @@
 #include <gtest/gtest.h>
 
 #include <Eigen/Geometry>
+#include <algorithm>
 #include <cmath>
 #include <set>
 
@@ -34,6 +35,8 @@ const std::string kBoards[] = {
     "{type: aprilgrid, cols: 6, rows: 6, square_m: 0.088, spacing: 0.3, dictionary: tag36h11}\n",
     "{type: aprilgrid, cols: 3, rows: 2, square_m: 0.1, spacing: 0.25, dictionary: tag25h9, "
     "joining_squares: true}\n",
+    "{type: aprilgrid, cols: 6, rows: 6, square_m: 0.088, spacing: 0.3, dictionary: tag36h11, "
+    "joining_squares: true, border_bits: 2}\n",
 };
 
 TEST(Target, FormatsWhatItParses) {
@@ -42,7 +45,63 @@ TEST(Target, FormatsWhatItParses) {
     EXPECT_EQ(formatTarget(parseTarget(text, "board.yaml")), text);
     ++round_trips;
   }
-  EXPECT_EQ(round_trips, 7);
+  EXPECT_EQ(round_trips, 8);
+}
+
+TEST(Target, ReadsKalibrsTargetFiles) {
+  const std::pair<std::string, std::string> cases[] = {
+      {"target_type: 'aprilgrid' #gridtype\ntagCols: 6               #number of apriltags\n"
+       "tagRows: 5\ntagSize: 0.088           #size [m]\ntagSpacing: 0.3\n",
+       "{type: aprilgrid, cols: 6, rows: 5, square_m: 0.088, spacing: 0.3, dictionary: tag36h11, "
+       "joining_squares: true}\n"},
+      // Basalt's, and old ones of Kalibr.
+      {"{\"tagCols\": 6, \"tagRows\": 6, \"tagSize\": 0.088, \"tagSpacing\": 0.3}",
+       "{type: aprilgrid, cols: 6, rows: 6, square_m: 0.088, spacing: 0.3, dictionary: tag36h11, "
+       "joining_squares: true}\n"},
+      {"target_type: aprilgrid\ntagCols: 6\ntagRows: 6\ntagSize: 8.8e-2\ntagSpacing: 0.3\n"
+       "codeOffset: 0\n",
+       "{type: aprilgrid, cols: 6, rows: 6, square_m: 0.088, spacing: 0.3, dictionary: tag36h11, "
+       "joining_squares: true}\n"},
+      {"target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\nrowSpacingMeters: 0.06\n"
+       "colSpacingMeters: 0.06\n",
+       "{type: checkerboard, cols: 6, rows: 7, square_m: 0.06}\n"},
+      {"target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\n"
+       "asymmetricGrid: True\n",
+       "{type: circles, cols: 4, rows: 11, square_m: 0.02, asymmetric: true}\n"},
+      {"target_type: 'circlegrid'\ntargetCols: 6\ntargetRows: 7\nspacingMeters: 0.02\n"
+       "asymmetricGrid: False\n",
+       "{type: circles, cols: 6, rows: 7, square_m: 0.02}\n"},
+  };
+  int read = 0;
+  for (const auto& [text, ours] : cases) {
+    EXPECT_EQ(formatTarget(parseTarget(text, "kalibr.yaml")), ours) << text;
+    ++read;
+  }
+  EXPECT_EQ(read, 6);
+}
+
+TEST(Target, DrawsTheBorderThatItSays) {
+  const auto ink = [](const std::string& more) {
+    return targetArtwork(parseTarget(
+        "{type: aprilgrid, cols: 2, rows: 2, square_m: 1, spacing: 0.3" + more + "}", "b"));
+  };
+  const auto black = [](const TargetArtwork& artwork, double x, double y) {
+    return std::any_of(artwork.rectangles.begin(), artwork.rectangles.end(), [&](const auto& r) {
+      return x > r.x && y > r.y && x < r.x + r.width && y < r.y + r.height;
+    });
+  };
+  // Two of ten cells on either side against one of eight: what is black all the way along the top.
+  const auto depth = [&](const TargetArtwork& artwork) {
+    for (double y = 0.005; y < 1.0; y += 0.01) {
+      for (double x = 0.01; x < 1.0; x += 0.02) {
+        if (!black(artwork, x, y)) return y;
+      }
+    }
+    return 1.0;
+  };
+  EXPECT_NEAR(depth(ink(", border_bits: 2")), 0.2, 0.011);
+  EXPECT_NEAR(depth(ink(", border_bits: 1")), 0.125, 0.011);
+  EXPECT_NEAR(depth(ink("")), 0.125, 0.011);
 }
 
 TEST(Target, ReadsTheDocumentedExample) {
@@ -96,6 +155,20 @@ TEST(Target, RefusalsNameSourceKeyValueAndExpectation) {
        "'tag99', expected one of tag36h11"},
       {"{type: aprilgrid, cols: 6, rows: 6, square_m: 1, spacing: .3, dictionary: tag16h5}",
        "has 30 tags, but the board needs 36"},
+      {"{type: aprilgrid, cols: 6, rows: 6, square_m: 1, spacing: .3, border_bits: 3}",
+       "border_bits: is 3, expected a whole number from 1 to 2"},
+      {"{target_type: aprilgrid, tagCols: 6, tagRows: 6, tagSize: 0.1}", "tagSpacing: is missing"},
+      {"{target_type: aprilgrid, tagCols: 6, tagRows: 6, tagSize: 0.1, tagSpacing: 0.3, lowId: 36}",
+       "lowId: is '36', expected 0"},
+      {"{target_type: aprilgrid, tagCols: 6, tagRows: 6, tagSize: 0.1, tagSpacing: 0.3, a: 1}",
+       "a: is not a key of Kalibr's aprilgrid"},
+      {"{target_type: checkerboard, targetCols: 6, targetRows: 7, rowSpacingMeters: 0.05, "
+       "colSpacingMeters: 0.06}",
+       "rowSpacingMeters: is 0.05, expected 0.06"},
+      {"{target_type: circlegrid, targetCols: 6, targetRows: 7, spacingMeters: 0.05, "
+       "asymmetricGrid: 2}",
+       "asymmetricGrid: is '2', expected True or False"},
+      {"{target_type: hexagons, tagCols: 6}", "target_type: is 'hexagons', expected aprilgrid"},
       {"{type: \"a\\nb\", cols: 6, rows: 6, square_m: 1}", "'a\\x0ab'"},
   };
   int refused = 0;
@@ -104,7 +177,7 @@ TEST(Target, RefusalsNameSourceKeyValueAndExpectation) {
     EXPECT_THAT(refusal(text), HasSubstr("board.yaml")) << text;
     ++refused;
   }
-  EXPECT_EQ(refused, 32);
+  EXPECT_EQ(refused, 39);
 }
 
 TEST(Target, PointsRunRowByRowFromTheOrigin) {
