@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "omnister/calibration/detections.h"
+#include "omnister/common/error.h"
 #include "omnister/common/pose.h"
 #include "omnister/common/progress.h"
 #include "omnister/lens/lens_file.h"
@@ -15,13 +16,28 @@
 
 namespace omnister {
 
+/// What to do with views that contradict each other: images turned or mirrored, of another camera,
+/// at another focus.
+enum class Contradictions {
+  kRefuse,    ///< ContradictionError names them
+  kLeaveOut,  ///< the largest set of views that agree, the others named
+  kKeep,      ///< all together, as if they agreed
+};
+
+/// Views fall into sets that each have a lens of their own.
+class ContradictionError : public Error {
+ public:
+  using Error::Error;
+};
+
 struct CalibrationOptions {
   std::string model = "auto";  ///< "auto" or a name of lensModelNames()
   /// Exactly this structure instead of a choice within `model`.
   std::optional<LensStructure> structure;
   int folds = 0;           ///< interleaved folds; 0: only what "auto" needs (5)
   bool board_warp = true;  ///< fit two parameters of board curvature
-  int threads = 0;         ///< 0: every core
+  Contradictions contradictions = Contradictions::kRefuse;
+  int threads = 0;  ///< 0: every core
   Progress progress;
 };
 
@@ -87,7 +103,8 @@ struct CalibrationResult {
 /// a focal guess. Views with a stage position share the pose of their board, moved by the known
 /// steps along an axis that is estimated too; lengths of board and stage are then of one unit.
 /// @throws Error with the reason where the data cannot carry a calibration (too few views, boards
-/// only square to the axis, …). Never returns a failed fit.
+/// only square to the axis, …), ContradictionError as CalibrationOptions::contradictions says.
+/// Never returns a failed fit.
 CalibrationResult calibrate(const Detections& detections, const CalibrationOptions& options);
 
 struct StereoCalibrationResult {

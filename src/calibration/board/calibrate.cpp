@@ -648,7 +648,7 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
   };
   report(0.0, "finding a first lens");
   Prepared prepared = prepareViews(detections, options.board_warp);
-  Fit first = trustedFirstFit(prepared, options.threads);
+  Fit first = agreedFirstFit(prepared, options);
   if (hasStage(detections)) first = joinByStage(detections, prepared, first);
   FitInput& input = prepared.input;
   report(0.2, "choosing the lens model");

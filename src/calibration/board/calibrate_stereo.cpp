@@ -44,7 +44,7 @@ Single fitAlone(const Detections& detections, const Board& board, const Calibrat
   try {
     Single single;
     single.prepared = prepareViews(detections, options.board_warp, &board);
-    const Fit first = trustedFirstFit(single.prepared, options.threads);
+    const Fit first = agreedFirstFit(single.prepared, options);
     single.selection = selectStructure(single.prepared.input, first, options);
     const auto& index = single.prepared.input.index;
     for (std::size_t i = 0; i < index.size(); ++i) single.place[index[i]] = i;
@@ -65,6 +65,8 @@ Single fitAlone(const Detections& detections, const Board& board, const Calibrat
       }
     }
     return single;
+  } catch (const ContradictionError& error) {
+    throw ContradictionError(std::string(side) + " camera: " + error.what());
   } catch (const Error& error) {
     throw Error(std::string(side) + " camera: " + error.what());
   }

@@ -27,6 +27,10 @@ Prepared prepareViews(const Detections& detections, bool warp, const Board* boar
 /// @throws Error when nothing explains the corners
 Fit trustedFirstFit(Prepared& prepared, int threads);
 
+/// The same, with views that contradict each other dealt with as the options say.
+/// @throws ContradictionError
+Fit agreedFirstFit(Prepared& prepared, const CalibrationOptions& options);
+
 struct Selection {
   Fit fit;
   std::vector<CandidateResult> candidates;
