@@ -5,6 +5,7 @@
 #include <cmath>
 #include <map>
 
+#include "calibration/board/board_scale.h"
 #include "calibration/board/calibration_steps.h"
 #include "calibration/board/stage_views.h"
 #include "calibration/uncertainty/covariance.h"
@@ -627,10 +628,9 @@ CalibrationResult assembleResult(const Prepared& prepared, const Selection& sele
   return result;
 }
 
-}  // namespace calibration
+namespace {
 
-CalibrationResult calibrate(const Detections& detections, const CalibrationOptions& options) {
-  using namespace calibration;
+CalibrationResult calibrateInUnit(const Detections& detections, const CalibrationOptions& options) {
   const auto& names = lensModelNames();
   if (!options.structure && options.model != "auto" &&
       std::find(names.begin(), names.end(), options.model) == names.end()) {
@@ -681,6 +681,17 @@ CalibrationResult calibrate(const Detections& detections, const CalibrationOptio
     result.stage = stage;
   }
   report(1.0, "estimating uncertainty");
+  return result;
+}
+
+}  // namespace
+}  // namespace calibration
+
+CalibrationResult calibrate(const Detections& detections, const CalibrationOptions& options) {
+  const double unit = calibration::fittingUnit({&detections});
+  CalibrationResult result =
+      calibration::calibrateInUnit(calibration::inUnit(detections, unit), options);
+  calibration::fromUnit(result, unit);
   return result;
 }
 

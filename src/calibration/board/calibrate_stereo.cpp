@@ -6,6 +6,7 @@
 #include <cstdio>
 #include <map>
 
+#include "calibration/board/board_scale.h"
 #include "calibration/board/calibration_steps.h"
 #include "calibration/uncertainty/covariance.h"
 #include "omnister/calibration/uncertainty.h"
@@ -80,9 +81,7 @@ struct Pair {
   Pose T_left_right;
 };
 
-}  // namespace
-
-StereoCalibrationResult calibrateStereo(const Detections& left, const Detections& right,
+StereoCalibrationResult calibrateInUnit(const Detections& left, const Detections& right,
                                         const CalibrationOptions& options) {
   if (left.views.size() != right.views.size()) {
     throw Error("the left camera has " + std::to_string(left.views.size()) +
@@ -382,6 +381,19 @@ StereoCalibrationResult calibrateStereo(const Detections& left, const Detections
         "images of a pair are not of one instant");
   }
   report(1.0, "joining the cameras");
+  return result;
+}
+
+}  // namespace
+
+StereoCalibrationResult calibrateStereo(const Detections& left, const Detections& right,
+                                        const CalibrationOptions& options) {
+  const double unit = fittingUnit({&left, &right});
+  StereoCalibrationResult result =
+      calibrateInUnit(inUnit(left, unit), inUnit(right, unit), options);
+  fromUnit(result.left, unit);
+  fromUnit(result.right, unit);
+  result.T_left_right.translation() *= unit;
   return result;
 }
 

@@ -135,6 +135,22 @@ TEST(CalibrateStereo, RefusesWithTheReason) {
   EXPECT_THAT(refusal(scene.seen_left, turned, scene.options()), HasSubstr("pairs agree"));
 }
 
+TEST(CalibrateStereo, TheUnitOfTheBoardIsThatOfTheBaseline) {
+  StereoScene scene(0.1);
+  const StereoCalibrationResult metres =
+      calibrateStereo(scene.seen_left, scene.seen_right, scene.options());
+  for (Detections* camera : {&scene.seen_left, &scene.seen_right}) {
+    for (ViewDetections& view : camera->views) {
+      for (Eigen::Vector3d& point : view.points) point *= 1000.0;
+    }
+  }
+  const StereoCalibrationResult millimetres =
+      calibrateStereo(scene.seen_left, scene.seen_right, scene.options());
+  EXPECT_NEAR(millimetres.T_left_right.translation().norm(),
+              1000.0 * metres.T_left_right.translation().norm(), 0.01);
+  EXPECT_NEAR(millimetres.right.height_px, metres.right.height_px, 1e-3);
+}
+
 TEST(RigFile, ComesBackAndFindsItsLenses) {
   RigFile rig;
   const std::filesystem::path folder =

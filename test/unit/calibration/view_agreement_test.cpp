@@ -112,5 +112,23 @@ TEST(ViewAgreement, OneCameraIsOneCamera) {
   EXPECT_EQ(refusal(test::simulatedBoards(*test::bentLens(), bent)), "accepted");
 }
 
+TEST(BoardScale, TheLensDoesNotDependOnTheUnitOfLength) {
+  const Detections metres = seenBy(lensAt(645.0, 473.0, 285.0), 7);
+  const CalibrationResult result = calibrate(metres, {});
+  for (const double unit : {1e-6, 1e-3, 1e3, 0.7}) {
+    Detections other = metres;
+    for (ViewDetections& view : other.views) {
+      for (Eigen::Vector3d& point : view.points) point *= unit;
+    }
+    const CalibrationResult again = calibrate(other, {});
+    EXPECT_NEAR(again.height_px / result.height_px, 1.0, 1e-6) << unit;
+    EXPECT_NEAR(again.rms_px / result.rms_px, 1.0, 1e-6) << unit;
+    EXPECT_NEAR(again.views[0].T_camera_board.translation().norm(),
+                unit * result.views[0].T_camera_board.translation().norm(), 1e-4 * unit);
+    EXPECT_NEAR(again.depth_uncertainty[0].distance / result.depth_uncertainty[0].distance, unit,
+                1e-3 * unit);
+  }
+}
+
 }  // namespace
 }  // namespace omnister
