@@ -8,6 +8,7 @@
 
 #include "calibration/board/board_scale.h"
 #include "calibration/board/calibration_steps.h"
+#include "calibration/fit/board_turns.h"
 #include "calibration/uncertainty/covariance.h"
 #include "omnister/calibration/uncertainty.h"
 #include "omnister/common/error.h"
@@ -81,6 +82,60 @@ struct Pair {
   Pose T_left_right;
 };
 
+/// Two cameras never see a board at the same pixels: who gives one camera's images twice gets a rig
+/// without a baseline.
+void refuseSameCamera(const Detections& left, const Detections& right) {
+  std::size_t both = 0;
+  std::size_t same = 0;
+  for (std::size_t i = 0; i < std::min(left.views.size(), right.views.size()); ++i) {
+    const ViewDetections& l = left.views[i];
+    const ViewDetections& r = right.views[i];
+    if (l.pixels.size() < 4 || r.pixels.size() < 4) continue;
+    ++both;
+    // Copies that were stored anew have their corners a hundredth of a pixel off.
+    std::size_t shared = 0;
+    double squares = 0.0;
+    for (std::size_t a = 0; a < l.pixels.size(); ++a) {
+      for (std::size_t b = 0; b < r.pixels.size(); ++b) {
+        if (l.points[a] != r.points[b]) continue;
+        squares += (l.pixels[a] - r.pixels[b]).squaredNorm();
+        ++shared;
+        break;
+      }
+    }
+    same += shared >= 4 && std::sqrt(squares / static_cast<double>(shared)) < 0.3;
+  }
+  if (both >= 2 && 2 * same > both) {
+    throw Error("left and right show the board at the same pixels in " + std::to_string(same) +
+                " of " + std::to_string(both) +
+                " pairs: these are one camera's images twice, expected those of two cameras");
+  }
+}
+
+/// Where a symmetric board was numbered from another end by the right camera, numbers it as the
+/// left one does: the pose between the cameras must be the same for all pairs.
+void numberAlike(const Board& board, const Single& left, Single& right, std::vector<Pair>& pairs) {
+  std::vector<TurnedAnswers> views;
+  for (const Pair& pair : pairs) {
+    const auto& corners = right.prepared.input.corners[pair.right];
+    TurnedAnswers& view = views.emplace_back();
+    view.turns = turnsOf(corners, board);
+    for (const int turn : view.turns) {
+      std::vector<Corner> none;
+      Pose pose = right.selection.fit.state.poses[pair.right];
+      turnBoard(turn, board, none, pose);
+      view.answers.push_back(left.selection.fit.state.poses[pair.left] * pose.inverse());
+    }
+  }
+  const std::vector<int> turns = agreeingTurns(views, board.half.norm());
+  for (std::size_t i = 0; i < pairs.size(); ++i) {
+    if (turns[i] == 0) continue;
+    Pose& pose = right.selection.fit.state.poses[pairs[i].right];
+    turnBoard(turns[i], board, right.prepared.input.corners[pairs[i].right], pose);
+    pairs[i].T_left_right = left.selection.fit.state.poses[pairs[i].left] * pose.inverse();
+  }
+}
+
 StereoCalibrationResult calibrateInUnit(const Detections& left, const Detections& right,
                                         const CalibrationOptions& options) {
   if (left.views.size() != right.views.size()) {
@@ -118,6 +173,8 @@ StereoCalibrationResult calibrateInUnit(const Detections& left, const Detections
     throw Error("only " + std::to_string(pairs.size()) +
                 " pairs have the board in both images, at least 3 are needed");
   }
+
+  numberAlike(board, l, r, pairs);
 
   // The pair whose pose is nearest to all others starts the joint fit: a median that outliers
   // cannot move.
@@ -374,6 +431,13 @@ StereoCalibrationResult calibrateInUnit(const Detections& left, const Detections
        {std::pair(&result.left, "left: "), std::pair(&result.right, "right: ")}) {
     for (const std::string& warning : camera->warnings) result.warnings.push_back(side + warning);
   }
+  const double baseline = result.T_left_right.translation().norm();
+  if (baseline < 1e-3 * board.half.norm() &&
+      Eigen::AngleAxisd(result.T_left_right.linear()).angle() < 1e-3) {
+    throw Error(
+        "both cameras come out in one place, looking one way: left and right seem to be images of "
+        "one camera, expected those of two");
+  }
   if (sigma > 1.5 * alone + 0.01) {
     result.warnings.push_back(
         "the cameras together fit " + formatFixed(sigma / std::max(alone, 1e-6), 1) +
@@ -388,6 +452,7 @@ StereoCalibrationResult calibrateInUnit(const Detections& left, const Detections
 
 StereoCalibrationResult calibrateStereo(const Detections& left, const Detections& right,
                                         const CalibrationOptions& options) {
+  refuseSameCamera(left, right);
   const double unit = fittingUnit({&left, &right});
   StereoCalibrationResult result =
       calibrateInUnit(inUnit(left, unit), inUnit(right, unit), options);

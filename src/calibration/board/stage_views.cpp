@@ -6,6 +6,7 @@
 #include <map>
 #include <tuple>
 
+#include "calibration/fit/board_turns.h"
 #include "calibration/uncertainty/covariance.h"
 #include "omnister/common/error.h"
 #include "omnister/common/numbers.h"
@@ -76,6 +77,35 @@ Eigen::Vector3d axisOfPairs(const std::vector<std::vector<std::size_t>>& placeme
               " times as far as the stage positions say: are both in metres?");
 }
 
+/// A stage does not turn the camera: where a symmetric board was numbered from different ends in
+/// views of one placement, numbers it alike.
+Fit numberedAlike(const Fit& alone, const std::vector<std::vector<std::size_t>>& placements,
+                  FitInput& input) {
+  Fit fit = alone;
+  for (const auto& placement : placements) {
+    std::vector<TurnedAnswers> views;
+    for (const std::size_t i : placement) {
+      TurnedAnswers& view = views.emplace_back();
+      view.turns = turnsOf(input.corners[i], input.board);
+      for (const int turn : view.turns) {
+        std::vector<Corner> none;
+        Pose pose = fit.state.poses[i];
+        turnBoard(turn, input.board, none, pose);
+        pose.translation().setZero();
+        view.answers.push_back(pose);
+      }
+    }
+    const std::vector<int> turns = agreeingTurns(views, 1.0);
+    for (std::size_t k = 0; k < placement.size(); ++k) {
+      const std::size_t i = placement[k];
+      if (turns[k] != 0) {
+        turnBoard(turns[k], input.board, input.corners[i], fit.state.poses[i]);
+      }
+    }
+  }
+  return fit;
+}
+
 /// Length of a free axis and its standard deviation.
 std::pair<double, double> scaleOf(const FitInput& input, const BundleState& state, double loss_px) {
   BundleOptions options = input.freedom();
@@ -93,7 +123,7 @@ bool hasStage(const Detections& detections) {
                      [](const ViewDetections& view) { return view.stage.has_value(); });
 }
 
-Fit joinByStage(const Detections& detections, Prepared& prepared, const Fit& first) {
+Fit joinByStage(const Detections& detections, Prepared& prepared, const Fit& alone) {
   FitInput& input = prepared.input;
   const double same = kSamePosition * input.board.half.norm();
   std::map<std::string, std::vector<std::size_t>> by_board;
@@ -120,6 +150,7 @@ Fit joinByStage(const Detections& detections, Prepared& prepared, const Fit& fir
         "nothing; leave the board where it is while the stage moves");
   }
 
+  const Fit first = numberedAlike(alone, placements, input);
   const Eigen::Vector3d axis = axisOfPairs(placements, travel, first.state.poses);
   // Boards square to the axis leave the scale along it open in single views, so only what no such
   // scale explains is refused here.

@@ -135,6 +135,46 @@ TEST(CalibrateStereo, RefusesWithTheReason) {
   EXPECT_THAT(refusal(scene.seen_left, turned, scene.options()), HasSubstr("pairs agree"));
 }
 
+// Cameras rolled against each other: a board that looks the same turned by a half is numbered from
+// another end in the right camera's images, in all of them or in some.
+TEST(CalibrateStereo, SymmetricBoardsMayBeNumberedFromEitherEnd) {
+  for (const int every : {1, 2, 3}) {
+    StereoScene scene(0.1);
+    int renumbered = 0;
+    for (std::size_t i = 0; i < scene.seen_right.views.size();
+         i += static_cast<std::size_t>(every)) {
+      ViewDetections& view = scene.seen_right.views[i];
+      if (view.points.size() != 48) continue;  // detectors number whole boards alone
+      for (Eigen::Vector3d& point : view.points) {
+        point = Eigen::Vector3d(7 * 0.03, 5 * 0.03, 0.0) - point;
+      }
+      ++renumbered;
+    }
+    EXPECT_GT(renumbered, 3);
+    const StereoCalibrationResult result =
+        calibrateStereo(scene.seen_left, scene.seen_right, scene.options());
+    EXPECT_NEAR(result.rms_px, 0.141, 0.015);
+    EXPECT_LT((result.T_left_right.translation() - scene.T_left_right.translation()).norm(), 3e-4);
+    EXPECT_LT(angleBetween(result.T_left_right, scene.T_left_right), 1e-3);
+    for (const ViewResult& view : result.right.views) EXPECT_TRUE(view.used) << view.reason;
+  }
+}
+
+TEST(CalibrateStereo, OneCameraTwiceIsNoRig) {
+  const StereoScene scene(0.1);
+  EXPECT_THAT(refusal(scene.seen_left, scene.seen_left, scene.options()),
+              HasSubstr("one camera's images twice"));
+  // Stored anew, the corners of copies differ by little.
+  Detections copy = scene.seen_left;
+  std::mt19937 random(2);
+  std::normal_distribution<double> noise(0.0, 0.05);
+  for (ViewDetections& view : copy.views) {
+    for (Eigen::Vector2d& pixel : view.pixels)
+      pixel += Eigen::Vector2d(noise(random), noise(random));
+  }
+  EXPECT_THAT(refusal(scene.seen_left, copy, scene.options()), HasSubstr("of 16 pairs"));
+}
+
 TEST(CalibrateStereo, TheUnitOfTheBoardIsThatOfTheBaseline) {
   StereoScene scene(0.1);
   const StereoCalibrationResult metres =

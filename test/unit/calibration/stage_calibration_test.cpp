@@ -30,6 +30,29 @@ std::string refusal(const Detections& detections, const CalibrationOptions& opti
   return "accepted";
 }
 
+// A board that looks the same turned by a half may be numbered from another end in some views.
+TEST(StageCalibration, ViewsOfOnePlacementAreNumberedAlike) {
+  StageScene scene;
+  scene.board.rows = 10;
+  Detections detections = scene.seen(3);
+  const CalibrationResult straight = calibrate(detections, scene.options());
+  int renumbered = 0;
+  for (std::size_t i = 1; i < detections.views.size(); i += 2) {
+    ViewDetections& view = detections.views[i];
+    if (view.points.size() != 120) continue;
+    for (Eigen::Vector3d& point : view.points) {
+      point = Eigen::Vector3d(11 * 0.04, 9 * 0.04, 0.0) - point;
+    }
+    ++renumbered;
+  }
+  ASSERT_GT(renumbered, 0);
+  const CalibrationResult result = calibrate(detections, scene.options());
+  ASSERT_TRUE(result.stage);
+  EXPECT_EQ(result.stage->views, straight.stage->views);
+  EXPECT_NEAR(result.height_px, straight.height_px, 0.05);
+  EXPECT_LT((result.stage->axis - straight.stage->axis).norm(), 1e-4);
+}
+
 TEST(StageCalibration, OneTiltedBoardAndFiveStepsGiveTheHeightAndTheAxis) {
   StageScene scene;
   scene.board.cols = 28;

@@ -83,7 +83,7 @@ const std::vector<Use>& uses() {
       {"target.yaml", {"calibrate", "--target", "target.yaml", "image.png", "--out", "out.yaml"}},
       {"image.png", {"calibrate", "--target", "target.yaml", "image.png", "--out", "out.yaml"}},
       {"corners.csv",
-       {"calibrate-stereo", "--left-detections", "corners.csv", "--right-detections", "corners.csv",
+       {"calibrate-stereo", "--left-detections", "corners.csv", "--right-detections", "right.csv",
         "--size", "64x48", "--model", "quadric", "--out-left", "left.yaml", "--out-right",
         "right.yaml", "--out-rig", "rig_out.yaml"}},
       {"scan/replay.yaml", {"calibrate-scan", "scan", "--out", "out.yaml"}},
@@ -135,6 +135,8 @@ class BadInput : public testing::Test {
     fs::copy(foreign / "mrcal.cameramodel", "camera.cameramodel");
     std::ofstream corners("corners.csv");
     corners << "view,u_px,v_px,x_m,y_m,z_m\n";
+    std::ofstream right_corners("right.csv");
+    right_corners << "view,u_px,v_px,x_m,y_m,z_m\n";
     std::ofstream positions("positions.csv");
     positions << "view,position_m\n";
     for (int view = 0; view < 6; ++view) {
@@ -142,10 +144,16 @@ class BadInput : public testing::Test {
       const Pose board = parsePose(kBoards[view], "board");
       for (int i = 0; i < 35; ++i) {
         const double x = 0.05 * (i % 7 - 3), y = 0.05 * (i / 7 - 2);
-        const auto pixel = lens.lens->project(board * Eigen::Vector3d(x, y, 0.0));
-        if (pixel && (pixel->array() > 0).all() && pixel->x() < 63 && pixel->y() < 47)
-          corners << "v" << view << "," << pixel->x() << "," << pixel->y() << "," << x << "," << y
-                  << ",0\n";
+        // The right camera stands 2 cm to the right of the left one.
+        for (const bool right : {false, true}) {
+          const Eigen::Vector3d place = board * Eigen::Vector3d(x, y, 0.0);
+          const auto pixel = lens.lens->project(place - Eigen::Vector3d(right ? 0.02 : 0.0, 0, 0));
+          if (!pixel || !(pixel->array() > 0).all() || pixel->x() >= 63 || pixel->y() >= 47) {
+            continue;
+          }
+          (right ? right_corners : corners) << "v" << view << "," << pixel->x() << "," << pixel->y()
+                                            << "," << x << "," << y << ",0\n";
+        }
       }
     }
     fs::create_directory("scan");
