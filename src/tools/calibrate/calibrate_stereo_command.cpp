@@ -8,6 +8,7 @@
 
 #include "omnister/calibration/rig_file.h"
 #include "omnister/common/error.h"
+#include "omnister/common/image_file.h"
 #include "tools/calibrate/calibration_arguments.h"
 #include "tools/calibrate/calibration_report.h"
 
@@ -81,8 +82,12 @@ void run(const Arguments& arguments) {
   Detections right =
       gatherDetections(arguments.common, arguments.right_images, arguments.right_detections, true);
   if (!arguments.left_detections.empty()) pairByName(left, right);
-  StereoCalibrationResult result =
-      calibrateStereo(left, right, calibrationOptions(arguments.common));
+  StereoCalibrationResult result;
+  try {
+    result = calibrateStereo(left, right, calibrationOptions(arguments.common));
+  } catch (const ContradictionError& error) {
+    throw ContradictionError(error.what() + contradictionHelp());
+  }
   nlohmann::ordered_json second_pass;
   if (!arguments.left_images.empty() && !arguments.common.one_pass) {
     const GuidedPass on_left =
@@ -109,6 +114,9 @@ void run(const Arguments& arguments) {
     for (auto [camera, side] : {std::pair{&result.left, "left"}, {&result.right, "right"}}) {
       camera->file.calibration.notes["second_pass"] = second_pass[side].dump();
     }
+  }
+  for (const std::string& remark : lengthRemarks(left, result.T_left_right.translation().norm())) {
+    result.warnings.push_back(remark);
   }
   for (const std::string& warning : result.warnings) say("warning: " + printable(warning, 1000));
 
@@ -138,8 +146,12 @@ void run(const Arguments& arguments) {
 
   if (!arguments.common.report_folder.empty()) {
     const std::string& folder = arguments.common.report_folder;
-    const std::string html_left = calibrationReport("Left camera", left, result.left);
-    const std::string html_right = calibrationReport("Right camera", right, result.right);
+    ReportPictures pages;
+    if (!arguments.left_images.empty()) {
+      pages.read = [](const std::string& name) { return readImage(name, ImageColor::kGray); };
+    }
+    const std::string html_left = calibrationReport("Left camera", left, result.left, pages);
+    const std::string html_right = calibrationReport("Right camera", right, result.right, pages);
     writeReport(folder, "report_left.html", html_left);
     writeReport(folder, "report_right.html", html_right);
   }
@@ -166,9 +178,10 @@ void addCalibrateStereo(CLI::App& app) {
       "Fit two rigidly joined cameras and the pose between them to pairs of images");
   const auto arguments = std::make_shared<Arguments>();
   addCalibrationArguments(*command, arguments->common);
-  command->add_option("--left", arguments->left_images, "Images of the left (reference) camera");
+  command->add_option("--left", arguments->left_images,
+                      "Images of the left (reference) camera, or a folder of them");
   command->add_option("--right", arguments->right_images,
-                      "Images of the right camera, in the same order");
+                      "Images of the right camera, in the same order, or a folder of them");
   command->add_option("--left-detections", arguments->left_detections,
                       "Corners of the left camera (CSV)");
   command->add_option("--right-detections", arguments->right_detections,
@@ -180,6 +193,8 @@ void addCalibrateStereo(CLI::App& app) {
                       "Rig file to write: both lens files and T_ref_disp (reference = left)");
   arguments->json = &addJsonFlag(*command);
   command->callback([arguments, command] {
+    arguments->left_images = picturesIn(arguments->left_images);
+    arguments->right_images = picturesIn(arguments->right_images);
     const bool from_files =
         !arguments->left_detections.empty() || !arguments->right_detections.empty();
     const bool from_images = !arguments->left_images.empty() || !arguments->right_images.empty();

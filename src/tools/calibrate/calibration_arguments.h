@@ -3,11 +3,14 @@
 #pragma once
 
 #include <nlohmann/json.hpp>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include "omnister/calibration/calibrate.h"
 #include "omnister/calibration/guided_pass.h"
+#include "omnister/calibration/picture_survey.h"
+#include "omnister/calibration/target.h"
 #include "tools/cli/commands.h"
 
 namespace omnister::tools {
@@ -21,10 +24,13 @@ struct CalibrationArguments {
   int threads = 0;
   bool flat_board = false;
   bool one_pass = false;
+  Contradictions contradictions = Contradictions::kRefuse;
+  double square_mm = 0.0;        ///< with images and no target file: size of the board that is seen
+  std::optional<Target> target;  ///< set where there is no file
 };
 
 /// `--target`, `--size`, `--model`, `--folds`, `--report`, `--threads`, `--flat-board`,
-/// `--one-pass`.
+/// `--one-pass`, `--contradictory`, `--square-mm`.
 void addCalibrationArguments(CLI::App& command, CalibrationArguments& arguments);
 
 CalibrationOptions calibrationOptions(const CalibrationArguments& arguments);
@@ -34,6 +40,29 @@ CalibrationOptions calibrationOptions(const CalibrationArguments& arguments);
 Detections gatherDetections(const CalibrationArguments& arguments,
                             const std::vector<std::string>& images,
                             const std::string& detections_file, bool keep_missed);
+
+/// The board: that of the file, or the one that was seen and given a size.
+Target targetOf(const CalibrationArguments& arguments);
+
+/// Where no target file is given: looks which board the pictures show. With `--square-mm` it
+/// becomes the target. @throws CLI::RequiredError that says what to write into a target file
+void chooseTarget(const std::vector<std::string>& images, CalibrationArguments& arguments);
+
+/// Corners from a folder as it is: pictures that cannot serve are left out by name.
+struct Gathered {
+  Detections detections;
+  std::vector<std::string> images;  ///< those to look at again in a second pass
+  std::vector<LeftOut> left_out;
+};
+Gathered gatherPictures(const CalibrationArguments& arguments,
+                        const std::vector<std::string>& images);
+
+/// Remarks on lengths that no board or rig has: squares given in millimetres.
+/// @param baseline_m 0 without a rig
+std::vector<std::string> lengthRemarks(const Detections& detections, double baseline_m);
+
+/// What to do about views that contradict each other, as the end of a message.
+std::string contradictionHelp();
 
 /// One view an image, empty where nothing was found.
 Detections overImages(Detections found, const std::vector<std::string>& images);

@@ -43,7 +43,7 @@ std::string structureText(const LensStructure& structure) {
 }  // namespace
 
 std::string calibrationReport(const std::string& title, const Detections& detections,
-                              const CalibrationResult& result) {
+                              const CalibrationResult& result, const ReportPictures& pictures) {
   const LensModel& lens = *result.file.lens;
   const cv::Size size = result.file.image_size;
   const Eigen::Vector2d center = lens.center();
@@ -66,7 +66,8 @@ std::string calibrationReport(const std::string& title, const Detections& detect
   const double top =
       lengths.empty() ? 1.0 : std::max(1e-6, 1.3 * lengths[lengths.size() * 99 / 100]);
 
-  std::string html = pageHead(title) + "<table>\n";
+  std::string html =
+      pageHead(title) + verdictSection(result, pictures) + "<h2>Figures</h2>\n<table>\n";
   html += row({"lens", escaped(result.file.calibration.notes.count("structure")
                                    ? result.file.calibration.notes.at("structure")
                                    : std::string(lens.model()))});
@@ -177,22 +178,11 @@ std::string calibrationReport(const std::string& title, const Detections& detect
   }
   if (result.file.covariance) {
     const ProjectionField field = projectionUncertainty(lens, *result.file.covariance, size, 48);
-    Plot plot(520, height, 0, field.cols, field.rows, 0);
-    for (int y = 0; y < field.rows; ++y) {
-      for (int x = 0; x < field.cols; ++x) {
-        const double sigma = field.at(x, y);
-        if (std::isnan(sigma)) {
-          plot.color(0.8, 0.8, 0.8);
-        } else {
-          const double level = std::sqrt(sigma / std::max(field.max_px, 1e-12));
-          plot.color(level, 0.9 - 0.6 * level, 1.0 - level);
-        }
-        plot.box(x, y, x + 1, y + 1);
-      }
-    }
-    figure(plot.finish("column of the grid", "row"),
-           "Projection uncertainty: RMS " + fixed(field.rms_px, 3) + " px, at most " +
-               fixed(field.max_px, 3) + " px (red); grey is beyond the calibrated field");
+    html += mapOverPicture(
+        field, detections, pictures,
+        "Projection uncertainty: RMS " + fixed(field.rms_px, 3) + " px, at most " +
+            fixed(field.max_px, 3) + " px; no colour beyond the calibrated field" +
+            (pictures.next.empty() ? "" : ". Outlined: where to hold the board next"));
   }
   {
     Plot plot(520, 300, 0, lens.maxTheta() * 180 / kPi, 0, radius * 1.1);
@@ -255,7 +245,7 @@ std::string calibrationReport(const std::string& title, const Detections& detect
                  view.used ? fixed(view.rms_px, 4) : "-", view.used ? "yes" : "no",
                  escaped(view.reason)});
   }
-  return html + "</table>\n</body></html>\n";
+  return html + "</table>\n" + thumbnails(detections, result, pictures) + "</body></html>\n";
 }
 
 }  // namespace omnister::tools
