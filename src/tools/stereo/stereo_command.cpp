@@ -17,6 +17,7 @@
 #include <vector>
 
 #include "omnister/common/error.h"
+#include "omnister/common/image_circle.h"
 #include "omnister/common/image_file.h"
 #include "omnister/common/numbers.h"
 #include "omnister/common/parallel.h"
@@ -26,6 +27,7 @@
 #include "omnister/stereo/input_region.h"
 #include "omnister/stereo/matcher.h"
 #include "omnister/stereo/matching_limits.h"
+#include "omnister/stereo/pose_doubt.h"
 #include "omnister/stereo/presets.h"
 #include "omnister/stereo/thesis_matcher.h"
 #include "tools/cli/commands.h"
@@ -176,7 +178,43 @@ Eigen::MatrixXd parsePoseSigma(const std::string& text) {
   return variances.asDiagonal();
 }
 
+// What a lens leaves dark on a sensor larger than its image says nothing of the scene, and noise in
+// it matches noise. Found where it takes a part of the lens' field.
+struct Surround {
+  cv::Mat mask;  // CV_8UC1; empty where the picture fills the field
+  std::string remark;
+};
+
+Surround findSurround(const cv::Mat& image, const LensModel& lens) {
+  constexpr double kRim = 2.0;           // half grey, half black [px]
+  constexpr double kLeastShare = 0.005;  // of the field
+  constexpr int kStep = 4;               // [px]
+  Surround surround;
+  const auto circle = findImageCircle({image});
+  if (!circle) return surround;
+  std::size_t field = 0;
+  std::size_t dark = 0;
+  for (int v = 0; v < image.rows; v += kStep) {
+    for (int u = 0; u < image.cols; u += kStep) {
+      const Eigen::Vector2d pixel(u, v);
+      if (!lens.unproject(pixel)) continue;
+      ++field;
+      dark += (pixel - circle->center).norm() > circle->radius;
+    }
+  }
+  if (static_cast<double>(dark) < kLeastShare * static_cast<double>(field)) return surround;
+  surround.mask = circleMask(*circle, image.size(), kRim);
+  surround.remark = "the picture is a disc of radius " +
+                    std::to_string(static_cast<int>(std::lround(circle->radius))) + " px about (" +
+                    std::to_string(static_cast<int>(std::lround(circle->center.x()))) + ", " +
+                    std::to_string(static_cast<int>(std::lround(circle->center.y()))) +
+                    "), smaller than the lens' field: the black around it is left out; --mask says "
+                    "otherwise";
+  return surround;
+}
+
 struct Inputs {
+  std::string surround;  // remark on what was left out, may be empty
   StereoGeometry geometry;
   cv::Mat reference;               // CV_8UC1
   cv::Mat color;                   // CV_8UC1 or CV_8UC3, for the cloud
@@ -269,6 +307,11 @@ Inputs readInputs(StereoArguments& arguments) {
                        "is " + sizeText(mask.size()) + ", but the lens " +
                            printable(arguments.lens) + " is for " + sizeText(lens.image_size));
     }
+  }
+  if (mask.empty()) {
+    Surround surround = findSurround(inputs.reference, *lens.lens);
+    mask = surround.mask;
+    inputs.surround = std::move(surround.remark);
   }
   const cv::Rect region = parseRegion(arguments.roi, lens.image_size, "--roi");
   if (arguments.reduce > 1) reduceInputs(arguments.reduce, &inputs);
@@ -372,7 +415,16 @@ void runStereo(StereoArguments& arguments, bool json) {
       field > 0 ? static_cast<double>(match.statistics.valid) / static_cast<double>(field) : 0.0;
   for (const auto& [reason, count] : match.statistics.rejected) result["rejected"][reason] = count;
   // Of images that give little: why.
-  const std::vector<std::string> remarks = imageRemarks(inputs.reference, inputs.displaced);
+  std::vector<std::string> remarks = imageRemarks(inputs.reference, inputs.displaced);
+  const double share =
+      field > 0 ? static_cast<double>(match.statistics.valid) / static_cast<double>(field) : 0.0;
+  if (share < kDoubtfulShare && remarks.empty() && inputs.displaced.size() == 1) {
+    if (const auto doubt =
+            poseDoubt(inputs.geometry, arguments.options, inputs.reference, inputs.displaced[0])) {
+      remarks.push_back(*doubt);
+    }
+  }
+  if (!inputs.surround.empty()) remarks.push_back(inputs.surround);
   for (const std::string& remark : remarks) {
     result["remarks"].push_back(remark);
     std::cerr << "omnister: " << remark << '\n';

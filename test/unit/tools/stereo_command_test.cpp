@@ -73,6 +73,98 @@ class StereoCommand : public test::CommandFolder {
   cv::Mat reference_, displaced_;
 };
 
+// A textured wall seen by two cameras that differ, large enough to try other poses small.
+class StereoMistakes : public StereoCommand {
+ protected:
+  void SetUp() override {
+    StereoCommand::SetUp();
+    const cv::Size size(320, 240);
+    LensFile left, right;
+    left.image_size = right.image_size = size;
+    left.lens = makeLens(LensStructure{}, {158.2, 120.9}, 130.0, 1.3);
+    right.lens = makeLens(LensStructure{}, {171.0, 113.0}, 143.0, 1.3);
+    writeLensFile(path("left.yaml"), left);
+    writeLensFile(path("right.yaml"), right);
+    const auto scene = test::wall(2.0, 0.25);
+    const Pose pose = parsePose(kTrue, "pose");
+    cv::imwrite(path("l.png"), test::look(scene, *left.lens, size, Pose::Identity()).image);
+    cv::imwrite(path("r.png"), test::look(scene, *right.lens, size, pose).image);
+  }
+
+  nlohmann::json matched(const std::map<std::string, std::string>& changed) const {
+    std::map<std::string, std::string> values = {{"--lens", path("left.yaml")},
+                                                 {"--lens-displaced", path("right.yaml")},
+                                                 {"--reference", path("l.png")},
+                                                 {"--displaced", path("r.png")},
+                                                 {"--pose", kTrue},
+                                                 {"--min-range", "1.2"},
+                                                 {"--matcher", "sweep"},
+                                                 {"--thesis-window", ""}};
+    for (const auto& [key, value] : changed) values[key] = value;
+    const Outcome outcome = run(arguments(values, {"--json"}));
+    EXPECT_EQ(outcome.code, 0) << outcome.err;
+    return nlohmann::json::parse(outcome.out);
+  }
+
+  static std::string remarksOf(const nlohmann::json& json) {
+    std::string text;
+    if (json.contains("remarks")) {
+      for (const auto& remark : json["remarks"]) text += remark.get<std::string>() + "\n";
+    }
+    return text;
+  }
+
+  // To the right, a little up, and turned about the axis.
+  static constexpr const char* kTrue = "0.3 -0.08 0.02 0 0.03 0.15 0.988";
+};
+
+TEST_F(StereoMistakes, NothingIsSaidOfAPairThatFits) {
+  const nlohmann::json json = matched({});
+  EXPECT_GT(json["valid_fraction"].get<double>(), 0.4);
+  EXPECT_EQ(remarksOf(json), "");
+}
+
+TEST_F(StereoMistakes, AnInvertedPoseIsNamed) {
+  const nlohmann::json json = matched({{"--pose", formatPose(parsePose(kTrue, "pose").inverse())}});
+  EXPECT_LT(json["valid_fraction"].get<double>(), 0.25);
+  EXPECT_THAT(remarksOf(json), HasSubstr("with the pose inverted"));
+}
+
+TEST_F(StereoMistakes, ExchangedImagesAndLensesAreNamed) {
+  EXPECT_THAT(remarksOf(matched({{"--reference", path("r.png")}, {"--displaced", path("l.png")}})),
+              HasSubstr("with the two images exchanged"));
+  EXPECT_THAT(remarksOf(matched({{"--reference", path("r.png")},
+                                 {"--displaced", path("l.png")},
+                                 {"--lens", path("right.yaml")},
+                                 {"--lens-displaced", path("left.yaml")}})),
+              HasSubstr("with the pose inverted"));
+}
+
+TEST_F(StereoMistakes, ABlackSurroundIsLeftOut) {
+  for (const char* name : {"l.png", "r.png"}) {
+    cv::Mat image = cv::imread(path(name), cv::IMREAD_GRAYSCALE);
+    cv::Mat dark(image.size(), CV_8UC1);
+    cv::RNG random(3);
+    random.fill(dark, cv::RNG::NORMAL, 8, 3);
+    cv::Mat disc(image.size(), CV_8UC1, cv::Scalar(0));
+    cv::circle(disc, {160, 120}, 112, cv::Scalar(255), -1);
+    image.copyTo(dark, disc);
+    cv::imwrite(path(name), dark);
+  }
+  const nlohmann::json json = matched({});
+  EXPECT_THAT(remarksOf(json), HasSubstr("the picture is a disc of radius 11"));
+  const cv::Mat range = cv::imread(path("range.tiff"), cv::IMREAD_UNCHANGED);
+  int inside = 0, outside = 0;
+  for (int v = 0; v < range.rows; ++v) {
+    for (int u = 0; u < range.cols; ++u) {
+      if (std::isnan(range.at<float>(v, u))) continue;
+      (std::hypot(u - 160, v - 120) > 112 ? outside : inside) += 1;
+    }
+  }
+  EXPECT_EQ(outside, 0);
+  EXPECT_GT(inside, 8000);
+}
+
 TEST_F(StereoCommand, WritesCloudRangeAndJson) {
   const Outcome outcome = run(arguments({}, {"--json", "--threads", "1"}));
   ASSERT_EQ(outcome.code, 0) << outcome.err;
