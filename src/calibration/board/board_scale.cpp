@@ -40,9 +40,9 @@ void fromUnit(CalibrationResult& result, double unit) {
   result.board_warp *= unit;
   for (DepthUncertainty& depth : result.depth_uncertainty) depth.distance *= unit;
   auto& notes = result.file.calibration.notes;
-  if (notes.count("board_warp") > 0) {
-    notes["board_warp"] =
-        formatNumber(result.board_warp[0]) + " " + formatNumber(result.board_warp[1]);
+  const auto warp = notes.find("board_warp");
+  if (warp != notes.end()) {
+    warp->second = formatNumber(result.board_warp[0]) + " " + formatNumber(result.board_warp[1]);
   }
 }
 
