@@ -15,7 +15,7 @@ namespace omnister {
 namespace {
 
 constexpr int kSmallSide = 320;  // [px]
-constexpr double kTimesBetter = 2.5;
+constexpr double kTimesBetter = 1.7;
 constexpr double kLeastShare = 0.12;
 
 struct Pair {

@@ -12,7 +12,7 @@
 namespace omnister {
 
 /// Below this share of the field with a range a pair is doubtful.
-inline constexpr double kDoubtfulShare = 0.25;
+inline constexpr double kDoubtfulShare = 0.35;
 
 /// Matches the pair small, as it is given and with the pose inverted, the images exchanged, the
 /// lenses exchanged, one lens for both, and the quaternion's numbers in the other order.
